@@ -1,0 +1,323 @@
+"""Every setting of the project, declared and validated once.  Imports no jax: a bad setting costs no compute.
+
+All classes are frozen and hashable (they are static arguments of jitted functions) and go to and from JSON.
+Angles are in degrees here, where people write them, and in radians everywhere else.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+PositiveFloat = Annotated[float, Field(gt=0)]
+NonNegativeFloat = Annotated[float, Field(ge=0)]
+PositiveInt = Annotated[int, Field(gt=0)]
+NonNegativeInt = Annotated[int, Field(ge=0)]
+Fraction = Annotated[float, Field(gt=0, le=1)]
+HalfAngleDeg = Annotated[float, Field(gt=0, lt=180)]
+DeviationDeg = Annotated[float, Field(ge=0, le=180)]
+Vector = tuple[float, float, float]
+
+
+def _check_ramp(ramp: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    fractions = [fraction for fraction, _ in ramp]
+    if not ramp or fractions != sorted(set(fractions)) or fractions[0] < 0 or fractions[-1] > 1:
+        raise ValueError("a ramp needs one or more (fraction, value) pairs with fractions rising strictly in [0, 1]")
+    return ramp
+
+
+# Piecewise linear in the fraction of the phase that is done, constant before the first and after the last pair.
+Ramp = Annotated[tuple[tuple[float, float], ...], AfterValidator(_check_ramp)]
+
+
+def constant(value: float) -> Ramp:
+    """A ramp that stays at one value."""
+    return ((0.0, value),)
+
+
+class Settings(BaseModel):
+    """Base of all settings: immutable, no unknown fields, no infinities."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+class SpacecraftConfig(Settings):
+    """The spacecraft (section 2.5 of the paper)."""
+
+    inertia: tuple[Vector, Vector, Vector] = ((60.0, 5.0, 1.0), (5.0, 50.0, 2.0), (1.0, 2.0, 70.0))
+    """Inertia tensor in body axes, row by row [kg m^2]."""
+    boresight: Vector = (1.0, 0.0, 0.0)
+    """Unit vector of the telescope in body axes."""
+    torque_limit: PositiveFloat = 2.0
+    """Largest torque about each body axis [N m]."""
+
+    @model_validator(mode="after")
+    def _physical(self) -> Self:
+        inertia = np.array(self.inertia)
+        if not np.allclose(inertia, inertia.T, rtol=1e-6, atol=0.0):
+            raise ValueError(f"inertia must be symmetric; got {self.inertia}")
+        principal = np.linalg.eigvalsh(inertia)
+        if principal[0] <= 0:
+            raise ValueError(f"inertia must be positive definite; its principal moments are {principal.tolist()}")
+        if principal[0] + principal[1] < principal[2] * (1 - 1e-6):
+            raise ValueError(
+                "inertia must obey the triangle inequality (no principal moment above the sum of the other two);"
+                f" its principal moments are {principal.tolist()}"
+            )
+        length = float(np.linalg.norm(self.boresight))
+        if abs(length - 1.0) > 1e-6:
+            raise ValueError(f"boresight must be a unit vector; {self.boresight} has length {length:.6g}")
+        return self
+
+
+class RewardConfig(Settings):
+    """Constants of the reward (Eq. 7 to 9 of the paper)."""
+
+    attitude_scale: PositiveFloat = 0.14 * 2 * np.pi
+    """Scale of exp(-phi / scale) [rad]."""
+    settled_angle_deg: PositiveFloat = 0.25
+    """Accuracy asked for: the maneuver is settled while phi is at most this [deg]."""
+    settled_bonus: float = 9.0
+    """Reward per step for being settled."""
+    torque_cost: float = 0.05
+    """Cost per step of |tau| / |tau_max|."""
+    torque_change_cost: float = 0.005
+    """Cost per step of the torque's change [1 / (N m)]."""
+    zone_height: NonNegativeFloat = 10.0
+    """beta: penalty per step inside the zone."""
+    zone_decay: PositiveFloat = 66.0
+    """alpha: how fast the penalty falls with the margin [1 / rad]."""
+    no_progress_cost: float = 1.0
+    """Cost of a step that does not bring the attitude closer."""
+    progress_tolerance_deg: NonNegativeFloat = 0.0
+    """Growth of phi in a step that still counts as progress [deg]; the paper counts a tie as none."""
+
+
+class ScenarioConfig(Settings):
+    """What scenarios are drawn (the deviation range comes from the curriculum or the evaluation)."""
+
+    max_rate_deg: NonNegativeFloat = 0.001
+    """Initial rates are uniform in plus or minus this, per axis [deg/s]."""
+    min_half_angle_deg: HalfAngleDeg = 15.0
+    """Smallest half angle of the keep-out zone [deg]."""
+    max_half_angle_deg: HalfAngleDeg = 30.0
+    """Largest half angle of the keep-out zone [deg]."""
+    separation_deg: NonNegativeFloat = 2.0
+    """Least angle between the zone's edge and the boresight at start and at target [deg]."""
+    infeasible_zone: Literal["resample", "shrink"] = "resample"
+    """Where the zone would hold start or target: draw the case again, or make the zone smaller."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.min_half_angle_deg > self.max_half_angle_deg:
+            raise ValueError(
+                f"min_half_angle_deg must be at most max_half_angle_deg; got {self.min_half_angle_deg} and"
+                f" {self.max_half_angle_deg}"
+            )
+        return self
+
+
+class TaskConfig(Settings):
+    """The maneuver: what is flown, and how it is judged."""
+
+    spacecraft: SpacecraftConfig = SpacecraftConfig()
+    reward: RewardConfig = RewardConfig()
+    scenario: ScenarioConfig = ScenarioConfig()
+    step_seconds: PositiveFloat = 0.1
+    """Time step; the torque is held over it [s]."""
+    episode_seconds: PositiveFloat = 100.0
+    """Length of a maneuver in evaluation [s]."""
+    angle_convention: Literal["full", "half"] = "full"
+    """phi is the full rotation angle, or half of it (the literal equation of the paper)."""
+
+    @property
+    def episode_steps(self) -> int:
+        """Steps of a maneuver."""
+        return round(self.episode_seconds / self.step_seconds)
+
+    @model_validator(mode="after")
+    def _at_least_one_step(self) -> Self:
+        if self.episode_steps < 1:
+            raise ValueError(
+                f"episode_seconds must hold at least one step of {self.step_seconds} s; got {self.episode_seconds}"
+            )
+        return self
+
+
+class EncodingConfig(Settings):
+    """Multi-resolution input encoding: the networks also see tanh(x / scale) of parts of the observation."""
+
+    attitude_scales: tuple[PositiveFloat, ...] = (0.005, 0.05)
+    """Scales for the vector part of q_e."""
+    rate_scales: tuple[PositiveFloat, ...] = (0.003, 0.03)
+    """Scales for the body rates [rad/s]."""
+    zone_margin_scales: tuple[PositiveFloat, ...] = (0.02, 0.1, 0.3)
+    """Scales for the margin to the zone [rad]."""
+
+
+NO_ENCODING = EncodingConfig(attitude_scales=(), rate_scales=(), zone_margin_scales=())
+
+
+class NetworkConfig(Settings):
+    """Shape of the policy and of each critic."""
+
+    hidden_sizes: tuple[PositiveInt, ...] = (256, 256)
+    """Units of each hidden layer (ReLU)."""
+    encoding: EncodingConfig = EncodingConfig()
+
+
+class SacConfig(Settings):
+    """Soft Actor-Critic."""
+
+    batch_size: PositiveInt = 256
+    """Transitions per update."""
+    buffer_size: PositiveInt = 1_000_000
+    """Transitions that the replay buffer holds."""
+    discount: Annotated[float, Field(ge=0, lt=1)] = 0.99
+    """gamma, per environment step."""
+    n_step: PositiveInt = 1
+    """Rewards summed before the critic's own estimate takes over."""
+    soft_update: Fraction = 0.005
+    """tau: share of the critic that its target takes over per update."""
+    target_entropy: float = -3.0
+    """Entropy that the automatic coefficient steers to."""
+    initial_entropy_coefficient: PositiveFloat = 1.0
+    """Entropy coefficient (alpha) at the start."""
+    reward_scale: PositiveFloat = 1.0
+    """Factor on the reward before it reaches the critic."""
+    policy_average: Fraction = 1.0
+    """Share of the policy that the evaluated, averaged policy takes over per update; 1 evaluates the last policy."""
+
+
+class PhaseConfig(Settings):
+    """One phase of the curriculum.  Ramps are lists of (fraction of the phase, value)."""
+
+    updates: NonNegativeInt
+    """Length of the phase in gradient updates."""
+    min_angle_deg: Ramp = constant(0.0)
+    """Smallest initial deviation [deg]."""
+    max_angle_deg: Ramp = constant(180.0)
+    """Largest initial deviation [deg]."""
+    angle_bias: Ramp = constant(1.0)
+    """Exponent p of angle = min + (max - min) u^p; 1 is uniform, above it small angles are drawn more often."""
+    zone_weight: Ramp = constant(0.0)
+    """Weight of the zone penalty."""
+    zone_tightening_deg: Ramp = constant(0.0)
+    """How much wider than it is the penalty sees the zone [deg]."""
+    effort_weight: Ramp = constant(0.0)
+    """Cost per step of the squared action, beyond the paper's reward."""
+    learning_rate: Ramp = constant(1e-4)
+    """Learning rate of all networks."""
+
+    @model_validator(mode="after")
+    def _angles_in_range(self) -> Self:
+        for name in ("min_angle_deg", "max_angle_deg"):
+            for _, value in getattr(self, name):
+                if not 0 <= value <= 180:
+                    raise ValueError(f"{name} must stay in [0, 180]; got {value}")
+        fractions = {fraction for ramp in (self.min_angle_deg, self.max_angle_deg) for fraction, _ in ramp}
+        for fraction in sorted(fractions):
+            low, high = (ramp_value(ramp, fraction) for ramp in (self.min_angle_deg, self.max_angle_deg))
+            if low > high:
+                raise ValueError(
+                    f"min_angle_deg must not exceed max_angle_deg; at {fraction} of the phase they are {low} and {high}"
+                )
+        for name, lowest in (("angle_bias", 1e-3), ("zone_weight", 0.0), ("effort_weight", 0.0), ("learning_rate", 0.0)):
+            for _, value in getattr(self, name):
+                if value < lowest:
+                    raise ValueError(f"{name} must be at least {lowest}; got {value}")
+        return self
+
+
+def ramp_value(ramp: Ramp, fraction: float) -> float:
+    """Value of a ramp at a fraction of its phase."""
+    fractions, values = zip(*ramp, strict=True)
+    return float(np.interp(fraction, fractions, values))
+
+
+class CurriculumConfig(Settings):
+    """The two phases of training: without and with the zone penalty."""
+
+    phase1: PhaseConfig
+    phase2: PhaseConfig
+
+    @property
+    def updates(self) -> int:
+        """Length of the whole training."""
+        return self.phase1.updates + self.phase2.updates
+
+
+class TrainConfig(Settings):
+    """One training run."""
+
+    preset: str = "custom"
+    """Name of the preset this configuration started from; kept for the record."""
+    task: TaskConfig = TaskConfig()
+    network: NetworkConfig = NetworkConfig()
+    sac: SacConfig = SacConfig()
+    curriculum: CurriculumConfig
+    num_envs: PositiveInt = 1
+    """Environments that run in parallel."""
+    updates_per_step: PositiveInt = 1
+    """Gradient updates for each step of all environments."""
+    prefill_steps: NonNegativeInt = 100
+    """Steps of all environments with random actions before the first update."""
+    training_episode_seconds: PositiveFloat = 100.0
+    """Training episodes are cut (truncated, not terminated) after this time [s]."""
+    eval_every: PositiveInt = 10_000
+    """Updates between evaluations and checkpoints; a phase ends with an evaluation in any case."""
+    eval_cases: PositiveInt = 1000
+    """Fixed scenarios of each evaluation."""
+    eval_min_angle_deg: DeviationDeg = 80.0
+    """Smallest initial deviation in evaluation [deg]."""
+    eval_max_angle_deg: DeviationDeg = 180.0
+    """Largest initial deviation in evaluation [deg]."""
+    seed: NonNegativeInt = 0
+    """Seed of everything random in the run."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.curriculum.updates == 0:
+            raise ValueError("curriculum must have at least one update in phase1.updates + phase2.updates; got 0")
+        if self.sac.batch_size > self.sac.buffer_size:
+            raise ValueError(
+                f"sac.batch_size must be at most sac.buffer_size; got {self.sac.batch_size} and {self.sac.buffer_size}"
+            )
+        if self.buffer_steps < self.sac.n_step:
+            raise ValueError(
+                f"sac.buffer_size must hold sac.n_step = {self.sac.n_step} steps of num_envs = {self.num_envs}"
+                f" environments; got {self.sac.buffer_size}"
+            )
+        if self.prefill_steps < self.sac.n_step:
+            raise ValueError(
+                f"prefill_steps must be at least sac.n_step = {self.sac.n_step}; got {self.prefill_steps}"
+            )
+        for name in ("curriculum.phase1.updates", "curriculum.phase2.updates", "eval_every"):
+            value = self
+            for part in name.split("."):
+                value = getattr(value, part)
+            if value % self.updates_per_step:
+                raise ValueError(f"{name} must be a multiple of updates_per_step = {self.updates_per_step}; got {value}")
+        if self.training_episode_steps < 1:
+            raise ValueError(
+                "training_episode_seconds must hold at least one step of"
+                f" {self.task.step_seconds} s; got {self.training_episode_seconds}"
+            )
+        if self.eval_min_angle_deg > self.eval_max_angle_deg:
+            raise ValueError(
+                "eval_min_angle_deg must be at most eval_max_angle_deg; got"
+                f" {self.eval_min_angle_deg} and {self.eval_max_angle_deg}"
+            )
+        return self
+
+    @property
+    def training_episode_steps(self) -> int:
+        """Steps after which a training episode is truncated."""
+        return round(self.training_episode_seconds / self.task.step_seconds)
+
+    @property
+    def buffer_steps(self) -> int:
+        """Steps of all environments that the replay buffer holds."""
+        return self.sac.buffer_size // self.num_envs

@@ -1,0 +1,1 @@
+"""Soft Actor-Critic for any environment; knows nothing of spacecraft."""

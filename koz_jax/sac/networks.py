@@ -1,0 +1,87 @@
+"""Policy and critics of Soft Actor-Critic, and the squashed Gaussian that the policy draws from."""
+
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+Params = Any  # a pytree of arrays, as flax makes it
+Encoding = tuple[tuple[int, int, float], ...]  # (start, stop, scale): also feed tanh(observation[start:stop] / scale)
+
+# Bounds on the policy's log standard deviation, as in Stable-Baselines3.
+LOG_STD_MIN = -20.0
+LOG_STD_MAX = 2.0
+
+# Weights uniform in +-1 / sqrt(inputs): the initialisation of torch.nn.Linear, hence of Stable-Baselines3.
+_kernel_init = nn.initializers.variance_scaling(1.0 / 3.0, "fan_in", "uniform")
+
+
+@struct.dataclass
+class SquashedGaussian:
+    """Distribution of actions: the tanh of a diagonal Gaussian (arXiv:1812.05905, appendix C)."""
+
+    mean: jax.Array  # (..., actions)
+    log_std: jax.Array  # (..., actions)
+
+    def sample(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Draw actions (..., actions) in (-1, 1) and their log probability (...)."""
+        noise = jax.random.normal(key, self.mean.shape)
+        raw = self.mean + jnp.exp(self.log_std) * noise
+        # log(1 - tanh(x)^2), written so that it neither overflows nor cancels.
+        log_slope = 2.0 * (jnp.log(2.0) - raw - jax.nn.softplus(-2.0 * raw))
+        log_density = -0.5 * noise**2 - self.log_std - 0.5 * jnp.log(2.0 * jnp.pi)
+        return jnp.tanh(raw), jnp.sum(log_density - log_slope, axis=-1)
+
+    def mode(self) -> jax.Array:
+        """The deterministic action, tanh(mean).  Returns (..., actions)."""
+        return jnp.tanh(self.mean)
+
+
+def encode(observation: jax.Array, encoding: Encoding) -> jax.Array:
+    """Append finer views of some entries.  observation: (..., n).  Returns (..., n + extra)."""
+    views = [jnp.tanh(observation[..., start:stop] / scale) for start, stop, scale in encoding]
+    return jnp.concatenate([observation, *views], axis=-1)
+
+
+class Mlp(nn.Module):
+    """Fully connected ReLU layers and a linear output."""
+
+    hidden_sizes: tuple[int, ...]
+    output_size: int
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """x: (..., inputs).  Returns (..., output_size)."""
+        for size in self.hidden_sizes:
+            x = nn.relu(nn.Dense(size, kernel_init=_kernel_init)(x))
+        return nn.Dense(self.output_size, kernel_init=_kernel_init)(x)
+
+
+class Policy(nn.Module):
+    """pi(a | s)."""
+
+    hidden_sizes: tuple[int, ...]
+    encoding: Encoding
+    action_size: int
+
+    @nn.compact
+    def __call__(self, observation: jax.Array) -> SquashedGaussian:
+        """observation: (..., n).  Returns the distribution of actions (..., action_size)."""
+        output = Mlp(self.hidden_sizes, 2 * self.action_size)(encode(observation, self.encoding))
+        mean, log_std = jnp.split(output, 2, axis=-1)
+        return SquashedGaussian(mean, jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX))
+
+
+class TwinCritic(nn.Module):
+    """Two independent estimates of Q(s, a)."""
+
+    hidden_sizes: tuple[int, ...]
+    encoding: Encoding
+
+    @nn.compact
+    def __call__(self, observation: jax.Array, action: jax.Array) -> jax.Array:
+        """observation: (..., n), action: (..., actions).  Returns (2, ...)."""
+        x = jnp.concatenate([encode(observation, self.encoding), action], axis=-1)
+        return jnp.stack([Mlp(self.hidden_sizes, 1)(x)[..., 0] for _ in range(2)])
