@@ -137,6 +137,16 @@ class TaskConfig(Settings):
         """Steps of a maneuver."""
         return round(self.episode_seconds / self.step_seconds)
 
+    def with_rules(
+        self, angle_convention: Literal["full", "half"] | None, infeasible_zone: Literal["resample", "shrink"] | None
+    ) -> TaskConfig:
+        """The same task judged by another angle convention or drawn by another rule; None keeps what is set."""
+        scenario = self.scenario.model_copy(
+            update={"infeasible_zone": infeasible_zone or self.scenario.infeasible_zone}
+        )
+        convention = angle_convention or self.angle_convention
+        return self.model_copy(update={"angle_convention": convention, "scenario": scenario})
+
     @model_validator(mode="after")
     def _at_least_one_step(self) -> Self:
         if self.episode_steps < 1:
@@ -253,7 +263,7 @@ class TrainConfig(Settings):
     """One training run."""
 
     preset: str = "custom"
-    """Name of the preset this configuration started from; kept for the record."""
+    """Settings to begin from: fast or paper; every other flag changes one of them."""
     task: TaskConfig = TaskConfig()
     network: NetworkConfig = NetworkConfig()
     sac: SacConfig = SacConfig()
@@ -268,6 +278,8 @@ class TrainConfig(Settings):
     """Training episodes are cut (truncated, not terminated) after this time [s]."""
     eval_every: PositiveInt = 10_000
     """Updates between evaluations and checkpoints; a phase ends with an evaluation in any case."""
+    log_every: PositiveInt = 1000
+    """Updates between lines of the log; also how long an interrupt may have to wait."""
     eval_cases: PositiveInt = 1000
     """Fixed scenarios of each evaluation."""
     eval_min_angle_deg: DeviationDeg = 80.0
@@ -294,7 +306,7 @@ class TrainConfig(Settings):
             raise ValueError(
                 f"prefill_steps must be at least sac.n_step = {self.sac.n_step}; got {self.prefill_steps}"
             )
-        for name in ("curriculum.phase1.updates", "curriculum.phase2.updates", "eval_every"):
+        for name in ("curriculum.phase1.updates", "curriculum.phase2.updates", "eval_every", "log_every"):
             value = self
             for part in name.split("."):
                 value = getattr(value, part)

@@ -93,8 +93,3 @@ def terms(outcome: Outcome, params: RewardParams, torque_limit: jax.Array) -> Re
 def total(reward_terms: RewardTerms, weights: RewardTerms) -> jax.Array:
     """Weighted sum of the terms.  Returns ()."""
     return jax.tree.reduce(jnp.add, jax.tree.map(jnp.multiply, reward_terms, weights))
-
-
-def paper_reward(outcome: Outcome, params: RewardParams, torque_limit: jax.Array) -> jax.Array:
-    """The paper's own reward r_t, zone penalty included.  Returns ()."""
-    return total(terms(outcome, params, torque_limit), PAPER_WEIGHTS)

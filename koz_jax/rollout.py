@@ -8,6 +8,7 @@ from flax import struct
 
 from koz_jax import dynamics, env, keep_out, observation, reward
 from koz_jax.env import EnvParams, EnvState
+from koz_jax.reward import RewardTerms
 from koz_jax.scenario import Scenario
 
 
@@ -24,13 +25,23 @@ class CaseResult:
     """What a maneuver is judged by (section 6 of the specification; Table 4 of the paper)."""
 
     initial_angle: jax.Array  # () [rad] full rotation angle at the start
-    reward: jax.Array  # () sum over the maneuver of the paper's reward
+    reward_terms: RewardTerms  # sum over the maneuver of each term
     settling_time: jax.Array  # () [s] time after which phi stays within the accuracy; nan if it does not
     control_effort: jax.Array  # () [N^2 m^2 s] integral of |tau|^2
     control_accuracy: jax.Array  # () [rad] phi at the end
     min_margin: jax.Array  # () [rad] smallest margin to any zone
     settled: jax.Array  # () bool
     violated: jax.Array  # () bool
+
+    @property
+    def reward(self) -> jax.Array:
+        """Sum over the maneuver of the paper's own reward.  Returns ()."""
+        return reward.total(self.reward_terms, reward.PAPER_WEIGHTS)
+
+    @property
+    def success(self) -> jax.Array:
+        """Settled and never in a zone.  Returns () bool."""
+        return self.settled & ~self.violated
 
 
 @struct.dataclass
@@ -47,7 +58,7 @@ class History:
 @struct.dataclass
 class _Tally:
     state: EnvState
-    reward: jax.Array
+    reward_terms: RewardTerms
     control_effort: jax.Array
     min_margin: jax.Array
     last_unsettled: jax.Array  # () int32, last instant (in steps) at which phi was outside; -1 if none
@@ -81,12 +92,13 @@ def run_case(
     def advance(tally: _Tally, _: None) -> tuple[_Tally, None]:
         action = controller.act(observation.observe(tally.state, params))
         state, outcome = env.step(tally.state, action, params)
+        terms = reward.terms(outcome, params.reward, params.spacecraft.torque_limit)
         margin = outcome.zone_margin
         if substeps > 1:
             margin = jnp.minimum(margin, _margin_between(tally.state, state.torque_B, params, substeps))
         return _Tally(
             state=state,
-            reward=tally.reward + reward.paper_reward(outcome, params.reward, params.spacecraft.torque_limit),
+            reward_terms=jax.tree.map(jnp.add, tally.reward_terms, terms),
             control_effort=tally.control_effort + outcome.torque**2 * params.dt,
             min_margin=jnp.minimum(tally.min_margin, margin),
             last_unsettled=unsettled_at(state, tally.last_unsettled),
@@ -94,7 +106,7 @@ def run_case(
 
     tally = _Tally(
         state=start,
-        reward=jnp.zeros(()),
+        reward_terms=jax.tree.map(lambda _: jnp.zeros(()), reward.PAPER_WEIGHTS),
         control_effort=jnp.zeros(()),
         min_margin=_margin(start, params),
         last_unsettled=unsettled_at(start, jnp.int32(-1)),
@@ -103,7 +115,7 @@ def run_case(
     settled = end.last_unsettled < steps
     return CaseResult(
         initial_angle=start.angle,
-        reward=end.reward,
+        reward_terms=end.reward_terms,
         settling_time=jnp.where(settled, (end.last_unsettled + 1) * params.dt, jnp.nan),
         control_effort=end.control_effort,
         control_accuracy=reward.pointing_error(end.state.angle, params.reward),

@@ -1,0 +1,138 @@
+"""A trained agent: load it, ask it, save it."""
+
+import dataclasses
+import functools
+import importlib.resources
+from pathlib import Path
+
+import jax
+import numpy as np
+from flax import struct
+from pydantic import ValidationError
+
+from koz_jax import observation, storage, task
+from koz_jax.config import NetworkConfig, Settings, TaskConfig
+from koz_jax.errors import UserError, explain
+from koz_jax.sac.networks import Params, Policy
+
+ACTION_SIZE = 3
+
+
+def policy_network(config: NetworkConfig) -> Policy:
+    """The policy's network for this task."""
+    return Policy(config.hidden_sizes, task.encoding(config.encoding), ACTION_SIZE)
+
+
+@struct.dataclass
+class PolicyController:
+    """The deterministic policy as a controller (see ``rollout.Controller``)."""
+
+    policy: Params
+    network: NetworkConfig = struct.field(pytree_node=False)
+
+    def act(self, observed: jax.Array) -> jax.Array:
+        """Action (..., 3) in [-1, 1] for an observation (..., 16)."""
+        return policy_network(self.network).apply(self.policy, observed).mode()  # pyright: ignore
+
+
+class Provenance(Settings):
+    """Where an agent comes from."""
+
+    command: str = ""
+    """The command that trained it."""
+    commit: str = ""
+    """Commit of the repository it was trained with."""
+    version: str = ""
+    """Version of koz_jax."""
+    seed: int = 0
+    """Seed of the training."""
+    phase: int = 0
+    """Phase of the curriculum that made it."""
+    updates: int = 0
+    """Gradient updates after which it was taken."""
+    table: dict[str, float | int | str] = {}
+    """Its Monte Carlo table."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Agent:
+    """A policy with what is needed to fly it and to know where it comes from."""
+
+    controller: PolicyController
+    task: TaskConfig
+    provenance: Provenance
+    name: str
+
+    def predict(self, observations: np.ndarray) -> np.ndarray:
+        """Deterministic actions.
+
+        observations: (16,) or (batch, 16), in the order of ``observation.LAYOUT``.  Returns (3,) or (batch, 3) in
+        [-1, 1]; times the torque limit that is the torque in body axes.
+        """
+        observed = np.asarray(observations, np.float32)
+        if observed.ndim not in (1, 2) or observed.shape[-1] != observation.SIZE:
+            raise UserError(
+                f"observations must have shape ({observation.SIZE},) or (batch, {observation.SIZE}), got {observed.shape}"
+            )
+        return np.asarray(_act(self.controller, observed))
+
+    def save(self, folder: Path) -> None:
+        """Write the agent as a folder of arrays and JSON."""
+        record = {
+            "network": self.controller.network.model_dump(),
+            "task": self.task.model_dump(),
+            "provenance": self.provenance.model_dump(),
+        }
+        storage.save_tree(folder, self.controller.policy, record)
+
+
+@jax.jit
+def _act(controller: PolicyController, observed: jax.Array) -> jax.Array:
+    return controller.act(observed)
+
+
+def shipped_agents() -> tuple[str, ...]:
+    """Names of the agents inside the package."""
+    return tuple(sorted(entry.name for entry in _shipped_folder().iterdir() if (entry / "record.json").is_file()))
+
+
+def _shipped_folder() -> Path:
+    return Path(str(importlib.resources.files("koz_jax"))) / "agents"
+
+
+def find_agent(name: str | Path) -> Path:
+    """Folder of an agent: a shipped one by name, the best of a run, or an agent folder itself.
+
+    Raises:
+        UserError: there is none; the message lists what is allowed.
+    """
+    if str(name) in shipped_agents():
+        return _shipped_folder() / str(name)
+    folder = Path(name)
+    # The latest phase's agent is the run's result.
+    for candidate in (folder, folder / "agents" / "phase2", folder / "agents" / "phase1"):
+        if (candidate / "record.json").is_file() and "network" in storage.read_record(candidate):
+            return candidate
+    raise UserError(
+        f"agent: {str(name)!r} is neither a shipped agent ({', '.join(shipped_agents())}) nor a folder with a trained"
+        " agent (a run, or one of its agents/ or snapshots/)"
+    )
+
+
+def load_agent(name: str | Path = "phase2") -> Agent:
+    """Load an agent by name or folder; see ``find_agent``."""
+    folder = find_agent(name)
+    record = storage.read_record(folder)
+    try:
+        network = NetworkConfig.model_validate(record["network"])
+        task_config = TaskConfig.model_validate(record["task"])
+        provenance = Provenance.model_validate(record["provenance"])
+    except KeyError as error:
+        raise UserError(f"{folder / 'record.json'}: {error} is missing") from None
+    except ValidationError as error:
+        raise UserError(f"{folder / 'record.json'}: {explain(error)}") from None
+    template = jax.eval_shape(
+        functools.partial(policy_network(network).init, jax.random.key(0)), jax.ShapeDtypeStruct((16,), np.float32)
+    )
+    policy = storage.load_tree(folder, template)
+    return Agent(PolicyController(policy, network), task_config, provenance, str(name))

@@ -1,0 +1,192 @@
+"""Monte Carlo evaluation: any number of cases in one jitted call, sharded over devices, memory bounded.
+
+A case is its index: case i of a seed is the same alone, in a chunk, or among a million.
+"""
+
+import dataclasses
+import functools
+import math
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+
+from koz_jax import rollout, scenario, task
+from koz_jax.agent import Agent
+from koz_jax.config import TaskConfig
+from koz_jax.env import EnvParams
+from koz_jax.errors import UserError
+from koz_jax.rollout import CaseResult, Controller
+from koz_jax.scenario import Scenario
+from koz_jax.summary import Summary
+
+# Cases that a device flies together: enough to fill the vector units, few enough to stay in its cache.
+_CHUNK = 500
+
+# Separates the draws of the Monte Carlo from those of training with the same seed.
+_PURPOSE = 0x4D43
+
+
+@dataclasses.dataclass(frozen=True)
+class MonteCarloConfig:
+    """Which cases are flown, and how they are checked; static."""
+
+    cases: int = 10_000
+    seed: int = 0
+    min_angle_deg: float = 80.0
+    max_angle_deg: float = 180.0
+    substeps: int = 1  # the zone is checked at so many instants per time step
+
+    def __post_init__(self) -> None:
+        _require(self.cases > 0, "cases", self.cases, "at least 1")
+        _require(0 <= self.seed < 2**32, "seed", self.seed, "from 0 to 2^32 - 1")
+        _require(self.substeps > 0, "substeps", self.substeps, "at least 1")
+        _require(0 <= self.min_angle_deg <= 180, "min_angle_deg", self.min_angle_deg, "in [0, 180]")
+        _require(
+            self.min_angle_deg <= self.max_angle_deg <= 180,
+            "max_angle_deg",
+            self.max_angle_deg,
+            f"in [min_angle_deg = {self.min_angle_deg}, 180]",
+        )
+
+
+def _require(holds: bool, name: str, value: float, allowed: str) -> None:
+    if not holds:
+        raise UserError(f"{name}: must be {allowed}, got {value}")
+
+
+@dataclasses.dataclass(frozen=True)
+class MonteCarlo:
+    """The outcome of every case, and what it took."""
+
+    agent: str  # name of the agent, or the folder it came from
+    config: MonteCarloConfig
+    results: CaseResult  # NumPy leaves (cases,)
+    compile_s: float  # [s] tracing and compiling
+    wall_s: float  # [s] flying
+
+
+def check_feasible(task_config: TaskConfig, max_angle_deg: float) -> None:
+    """Refuse a deviation range in which ``resample`` could draw for ever.
+
+    The boresight is at most half the deviation away from the zone's axis at start and target.
+    """
+    needed = 2.0 * (task_config.scenario.min_half_angle_deg + task_config.scenario.separation_deg)
+    if task_config.scenario.infeasible_zone == "resample" and max_angle_deg <= needed:
+        raise UserError(
+            f"max_angle_deg: must be above {needed:g} deg, so that a zone fits between start and target under the rule"
+            f" 'resample'; got {max_angle_deg:g}. The rule 'shrink' leaves such zones out."
+        )
+
+
+def draw_case(task_config: TaskConfig, config: MonteCarloConfig, case: jax.Array) -> Scenario:
+    """The scenario of one case.  case: () int, its index."""
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), _PURPOSE), case)
+    ranges = task.scenario_ranges(task_config.scenario, config.min_angle_deg, config.max_angle_deg)
+    boresight_B = jnp.array(task_config.spacecraft.boresight)
+    return scenario.sample(key, ranges, boresight_B, task_config.scenario.infeasible_zone)
+
+
+@functools.partial(jax.jit, static_argnames=("task_config", "config", "mesh"))
+def _fly_cases(
+    controller: Controller, params: EnvParams, cases: jax.Array, task_config: TaskConfig, config: MonteCarloConfig, mesh: Mesh
+) -> CaseResult:
+    """cases: (devices * chunks * chunk,) int32 indices.  Returns leaves of the same length."""
+
+    def one(case: jax.Array) -> CaseResult:
+        drawn = draw_case(task_config, config, case)
+        return rollout.run_case(controller, drawn, params, task_config.episode_steps, config.substeps)
+
+    def on_one_device(cases: jax.Array) -> CaseResult:
+        return jax.lax.map(one, cases, batch_size=_CHUNK)
+
+    over_cases = PartitionSpec("cases")
+    sharded = jax.shard_map(on_one_device, mesh=mesh, in_specs=over_cases, out_specs=over_cases, check_vma=False)
+    return sharded(cases)
+
+
+def _arguments(
+    controller: Controller, task_config: TaskConfig, config: MonteCarloConfig
+) -> tuple[tuple[Controller, EnvParams, jax.Array], dict[str, TaskConfig | MonteCarloConfig | Mesh]]:
+    check_feasible(task_config, config.max_angle_deg)
+    devices = jax.local_devices()[: config.cases]
+    # Every device flies equally many cases; the surplus is flown and dropped.
+    padded = -(-config.cases // len(devices)) * len(devices)
+    traced = (controller, task.env_params(task_config), jnp.arange(padded, dtype=jnp.int32))
+    return traced, {"task_config": task_config, "config": config, "mesh": Mesh(np.array(devices), ("cases",))}
+
+
+def _to_host(results: CaseResult, cases: int) -> CaseResult:
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[:cases], results)
+
+
+def fly_cases(controller: Controller, task_config: TaskConfig, config: MonteCarloConfig) -> CaseResult:
+    """Fly all cases on all local devices.  Returns NumPy leaves (cases,)."""
+    traced, static = _arguments(controller, task_config, config)
+    return _to_host(_fly_cases(*traced, **static), config.cases)
+
+
+def run_cases(agent: Agent, task_config: TaskConfig, config: MonteCarloConfig) -> MonteCarlo:
+    """``fly_cases`` for an agent, with compilation and flight timed apart."""
+    traced, static = _arguments(agent.controller, task_config, config)
+    start = time.perf_counter()
+    compiled = _fly_cases.lower(*traced, **static).compile()
+    ready = time.perf_counter()
+    results = jax.block_until_ready(compiled(*traced))
+    done = time.perf_counter()
+    results = _to_host(results, config.cases)
+    return MonteCarlo(agent.name, config, results, compile_s=ready - start, wall_s=done - ready)
+
+
+def report(flown: MonteCarlo, summary: Summary) -> dict[str, float | int | str | None]:
+    """The results as a JSON object (keys as in the documentation of ``eval_mc.py``); nan becomes null."""
+    rows = {name: None if math.isnan(value) else value for name, value in vars(summary).items()}
+    return {
+        "cases": flown.config.cases,
+        "seed": flown.config.seed,
+        "agent": flown.agent,
+        **rows,
+        "compile_s": flown.compile_s,
+        "wall_s": flown.wall_s,
+    }
+
+
+def monte_carlo(
+    agent: Agent, cases: int = 10_000, seed: int = 0, task_config: TaskConfig | None = None, **options: float
+) -> MonteCarlo:
+    """Fly an agent over ``cases`` random cases of the task it was trained for (or of another one).
+
+    options: further fields of ``MonteCarloConfig``.
+    """
+    config = MonteCarloConfig(cases=cases, seed=seed, **options)  # pyright: ignore[reportArgumentType]
+    return run_cases(agent, task_config or agent.task, config)
+
+
+def fly_case(
+    agent: Agent, case: int, config: MonteCarloConfig, task_config: TaskConfig | None = None
+) -> tuple[rollout.History, CaseResult]:
+    """Fly one case of the draw again and keep its history."""
+    _require(0 <= case < config.cases, "case", case, f"from 0 to cases - 1 = {config.cases - 1}")
+    flown = task_config or agent.task
+    check_feasible(flown, config.max_angle_deg)
+    return fly_scenario(agent, draw_case(flown, config, jnp.int32(case)), flown, config.substeps)
+
+
+def fly_scenario(
+    agent: Agent, drawn: Scenario, task_config: TaskConfig | None = None, substeps: int = 1
+) -> tuple[rollout.History, CaseResult]:
+    """Fly one scenario, and keep its history and its judgement."""
+    flown = task_config or agent.task
+    return _fly_and_judge(agent.controller, drawn, task.env_params(flown), flown.episode_steps, substeps)
+
+
+@functools.partial(jax.jit, static_argnames=("steps", "substeps"))
+def _fly_and_judge(
+    controller: Controller, drawn: Scenario, params: EnvParams, steps: int, substeps: int
+) -> tuple[rollout.History, CaseResult]:
+    history = rollout.fly(controller, drawn, params, steps)
+    return history, rollout.run_case(controller, drawn, params, steps, substeps)
+
+
