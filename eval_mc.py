@@ -1,14 +1,20 @@
 """Judge a controller by Monte Carlo: ``python eval_mc.py``, ``python eval_mc.py --help`` for every setting."""
 
+from __future__ import annotations
+
 import dataclasses
 import sys
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
-from pydantic import ValidationError
 
-from koz_jax.errors import UserError, explain
+from koz_jax.errors import UserError, exit_status
+
+if TYPE_CHECKING:
+    from koz_jax.agent import Agent
+    from koz_jax.config import TaskConfig
+    from koz_jax.evaluation import MonteCarloConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,48 +49,72 @@ class EvalArgs:
 
 def main(argv: list[str]) -> int:
     """Evaluate and print.  Returns the exit status."""
-    try:
-        return _evaluate(tyro.cli(EvalArgs, args=argv, prog="eval_mc.py"))
-    except ValidationError as error:
-        print(f"error: {explain(error)}", file=sys.stderr)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-    return 2
+    return exit_status(lambda: _evaluate(tyro.cli(EvalArgs, args=argv, prog="eval_mc.py")))
 
 
 def _evaluate(args: EvalArgs) -> int:
-    from koz_jax import evaluation, runtime, storage, tables
+    # jax is imported only now: --help and flags that do not exist are answered at once.
+    from koz_jax import evaluation, runtime
     from koz_jax.agent import load_agent
-    from koz_jax.summary import summarise, table
 
+    config = evaluation.MonteCarloConfig(args.cases, args.seed, args.min_angle_deg, args.max_angle_deg, args.substeps)
+    _check_outputs(args)
     runtime.configure()
-    config = evaluation.MonteCarloConfig(
-        args.cases, args.seed, args.min_angle_deg, args.max_angle_deg, args.substeps
-    )
     agent = load_agent(args.agent)
     task = agent.task.with_rules(args.angle_convention, args.infeasible_zone)
     evaluation.check_feasible(task, config.max_angle_deg)
-    for path in (args.json, args.csv, args.history):
-        if path is not None and not path.parent.is_dir():
-            raise UserError(f"{path}: the folder {path.parent} does not exist")
-
     if args.replay_case is not None:
-        history, result = evaluation.fly_case(agent, args.replay_case, config, task)
-        path = args.history or Path(f"case-{args.replay_case}.csv")
-        storage.write_text(path, tables.history_csv(history, task))
-        print(tables.describe_case(args.replay_case, result))
-        print(f"history: {path}")
-        return 0
+        _replay(agent, task, config, args.replay_case, _history_path(args))
+    else:
+        _monte_carlo(agent, task, config, args)
+    return 0
+
+
+def _history_path(args: EvalArgs) -> Path:
+    return args.history or Path(f"case-{args.replay_case}.csv")
+
+
+def _check_outputs(args: EvalArgs) -> None:
+    """Refuse files that cannot be written, or that the rest of the command line leaves empty."""
+    from koz_jax import storage
+
+    outputs = {"json": args.json, "csv": args.csv}
+    if args.replay_case is None:
+        if args.history is not None:
+            raise UserError(f"history: is written by --replay-case only, got {args.history} without it")
+    else:
+        for name, path in outputs.items():
+            if path is not None:
+                raise UserError(f"{name}: is not written with --replay-case, which writes --history; got {path}")
+        if not 0 <= args.replay_case < args.cases:
+            raise UserError(f"replay_case: must be from 0 to cases - 1 = {args.cases - 1}, got {args.replay_case}")
+        outputs["history"] = _history_path(args)
+    for name, path in outputs.items():
+        if path is not None:
+            storage.check_writable(name, path)
+
+
+def _replay(agent: Agent, task: TaskConfig, config: MonteCarloConfig, case: int, path: Path) -> None:
+    from koz_jax import evaluation, storage, tables
+
+    history, result = evaluation.fly_case(agent, case, config, task)
+    storage.write_text(path, tables.history_csv(history, task))
+    print(tables.describe_case(case, result))
+    print(f"history: {path}")
+
+
+def _monte_carlo(agent: Agent, task: TaskConfig, config: MonteCarloConfig, args: EvalArgs) -> None:
+    from koz_jax import evaluation, storage, tables
+    from koz_jax.summary import summarise, table
 
     flown = evaluation.run_cases(agent, task, config)
     summary = summarise(flown.results)
-    print(table(summary, args.cases, args.agent))
+    print(table(summary, config.cases, args.agent))
     print(f"compiled in {flown.compile_s:.1f} s, flown in {flown.wall_s:.1f} s")
     if args.json:
         storage.write_json(args.json, evaluation.report(flown, summary))
     if args.csv:
         storage.write_text(args.csv, tables.cases_csv(flown.results))
-    return 0
 
 
 if __name__ == "__main__":

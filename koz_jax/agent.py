@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 from flax import struct
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from koz_jax import observation, storage, task
 from koz_jax.config import NetworkConfig, Settings, TaskConfig
@@ -23,8 +23,7 @@ def policy_network(config: NetworkConfig) -> Policy:
     return Policy(config.hidden_sizes, task.encoding(config.encoding), ACTION_SIZE)
 
 
-@struct.dataclass
-class PolicyController:
+class PolicyController(struct.PyTreeNode):
     """The deterministic policy as a controller (see ``rollout.Controller``)."""
 
     policy: Params
@@ -50,8 +49,18 @@ class Provenance(Settings):
     """Phase of the curriculum that made it."""
     updates: int = 0
     """Gradient updates after which it was taken."""
-    table: dict[str, float | int | str] = {}
+    refinements: int = 0
+    """Refinement iterations after those."""
+    table: dict[str, float | int | str] = Field(default={})
     """Its Monte Carlo table."""
+
+
+class _Record(Settings):
+    """What is saved beside the weights."""
+
+    network: NetworkConfig
+    task: TaskConfig
+    provenance: Provenance
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,19 +80,14 @@ class Agent:
         """
         observed = np.asarray(observations, np.float32)
         if observed.ndim not in (1, 2) or observed.shape[-1] != observation.SIZE:
-            raise UserError(
-                f"observations must have shape ({observation.SIZE},) or (batch, {observation.SIZE}), got {observed.shape}"
-            )
+            allowed = f"({observation.SIZE},) or (batch, {observation.SIZE})"
+            raise UserError(f"observations: must have shape {allowed}, got {observed.shape}")
         return np.asarray(_act(self.controller, observed))
 
-    def save(self, folder: Path) -> None:
+    def save(self, folder: Path | str) -> None:
         """Write the agent as a folder of arrays and JSON."""
-        record = {
-            "network": self.controller.network.model_dump(),
-            "task": self.task.model_dump(),
-            "provenance": self.provenance.model_dump(),
-        }
-        storage.save_tree(folder, self.controller.policy, record)
+        record = _Record(network=self.controller.network, task=self.task, provenance=self.provenance)
+        storage.save_tree(Path(folder), self.controller.policy, record.model_dump())
 
 
 @jax.jit
@@ -93,7 +97,7 @@ def _act(controller: PolicyController, observed: jax.Array) -> jax.Array:
 
 def shipped_agents() -> tuple[str, ...]:
     """Names of the agents inside the package."""
-    return tuple(sorted(entry.name for entry in _shipped_folder().iterdir() if (entry / "record.json").is_file()))
+    return tuple(sorted(record.parent.name for record in _shipped_folder().glob("[!.]*/record.json")))
 
 
 def _shipped_folder() -> Path:
@@ -105,34 +109,33 @@ def find_agent(name: str | Path) -> Path:
 
     Raises:
         UserError: there is none; the message lists what is allowed.
+
     """
     if str(name) in shipped_agents():
         return _shipped_folder() / str(name)
     folder = Path(name)
     # The latest phase's agent is the run's result.
     for candidate in (folder, folder / "agents" / "phase2", folder / "agents" / "phase1"):
-        if (candidate / "record.json").is_file() and "network" in storage.read_record(candidate):
+        if storage.is_saved(candidate) and "network" in storage.read_record(candidate):
             return candidate
+    shipped = ", ".join(shipped_agents()) or "there is none"
     raise UserError(
-        f"agent: {str(name)!r} is neither a shipped agent ({', '.join(shipped_agents())}) nor a folder with a trained"
-        " agent (a run, or one of its agents/ or snapshots/)"
+        f"agent: {str(name)!r} is neither a shipped agent ({shipped}) nor a folder with a trained agent (a run, or one"
+        " of the folders in its agents/)"
     )
 
 
 def load_agent(name: str | Path = "phase2") -> Agent:
     """Load an agent by name or folder; see ``find_agent``."""
     folder = find_agent(name)
-    record = storage.read_record(folder)
+    content = storage.read_record(folder)
     try:
-        network = NetworkConfig.model_validate(record["network"])
-        task_config = TaskConfig.model_validate(record["task"])
-        provenance = Provenance.model_validate(record["provenance"])
-    except KeyError as error:
-        raise UserError(f"{folder / 'record.json'}: {error} is missing") from None
+        record = _Record.model_validate({name: content[name] for name in _Record.model_fields if name in content})
     except ValidationError as error:
         raise UserError(f"{folder / 'record.json'}: {explain(error)}") from None
     template = jax.eval_shape(
-        functools.partial(policy_network(network).init, jax.random.key(0)), jax.ShapeDtypeStruct((16,), np.float32)
+        functools.partial(policy_network(record.network).init, jax.random.key(0)),
+        jax.ShapeDtypeStruct((observation.SIZE,), np.float32),
     )
     policy = storage.load_tree(folder, template)
-    return Agent(PolicyController(policy, network), task_config, provenance, str(name))
+    return Agent(PolicyController(policy, record.network), record.task, record.provenance, str(name))

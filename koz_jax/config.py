@@ -13,8 +13,10 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 
 PositiveFloat = Annotated[float, Field(gt=0)]
 NonNegativeFloat = Annotated[float, Field(ge=0)]
-PositiveInt = Annotated[int, Field(gt=0)]
-NonNegativeInt = Annotated[int, Field(ge=0)]
+# Counts are int32 on the device, and so are the bits of a seed.
+PositiveInt = Annotated[int, Field(gt=0, lt=2**31)]
+NonNegativeInt = Annotated[int, Field(ge=0, lt=2**31)]
+Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Fraction = Annotated[float, Field(gt=0, le=1)]
 HalfAngleDeg = Annotated[float, Field(gt=0, lt=180)]
 DeviationDeg = Annotated[float, Field(ge=0, le=180)]
@@ -28,12 +30,17 @@ def _check_ramp(ramp: tuple[tuple[float, float], ...]) -> tuple[tuple[float, flo
     return ramp
 
 
+def _check_steps(name: str, seconds: float, step_seconds: float) -> None:
+    if not 0.5 < seconds / step_seconds < 2**31 - 1:
+        raise ValueError(f"{name} must hold 1 to 2^31 - 1 steps of step_seconds = {step_seconds}; got {seconds}")
+
+
 # Piecewise linear in the fraction of the phase that is done, constant before the first and after the last pair.
 Ramp = Annotated[tuple[tuple[float, float], ...], AfterValidator(_check_ramp)]
 
 
 def constant(value: float) -> Ramp:
-    """A ramp that stays at one value."""
+    """Make a ramp that stays at one value."""
     return ((0.0, value),)
 
 
@@ -123,8 +130,11 @@ class TaskConfig(Settings):
     """The maneuver: what is flown, and how it is judged."""
 
     spacecraft: SpacecraftConfig = SpacecraftConfig()
+    """The body that turns, and its telescope."""
     reward: RewardConfig = RewardConfig()
+    """What a step is worth."""
     scenario: ScenarioConfig = ScenarioConfig()
+    """Where maneuvers start, and the zone in their way."""
     step_seconds: PositiveFloat = 0.1
     """Time step; the torque is held over it [s]."""
     episode_seconds: PositiveFloat = 100.0
@@ -140,19 +150,17 @@ class TaskConfig(Settings):
     def with_rules(
         self, angle_convention: Literal["full", "half"] | None, infeasible_zone: Literal["resample", "shrink"] | None
     ) -> TaskConfig:
-        """The same task judged by another angle convention or drawn by another rule; None keeps what is set."""
-        scenario = self.scenario.model_copy(
-            update={"infeasible_zone": infeasible_zone or self.scenario.infeasible_zone}
-        )
-        convention = angle_convention or self.angle_convention
-        return self.model_copy(update={"angle_convention": convention, "scenario": scenario})
+        """Judge the same task by another angle convention, or draw it by another rule; None keeps what is set."""
+        changed = self.model_dump()
+        if angle_convention is not None:
+            changed["angle_convention"] = angle_convention
+        if infeasible_zone is not None:
+            changed["scenario"]["infeasible_zone"] = infeasible_zone
+        return TaskConfig.model_validate(changed)
 
     @model_validator(mode="after")
-    def _at_least_one_step(self) -> Self:
-        if self.episode_steps < 1:
-            raise ValueError(
-                f"episode_seconds must hold at least one step of {self.step_seconds} s; got {self.episode_seconds}"
-            )
+    def _whole_steps(self) -> Self:
+        _check_steps("episode_seconds", self.episode_seconds, self.step_seconds)
         return self
 
 
@@ -176,6 +184,7 @@ class NetworkConfig(Settings):
     hidden_sizes: tuple[PositiveInt, ...] = (256, 256)
     """Units of each hidden layer (ReLU)."""
     encoding: EncodingConfig = EncodingConfig()
+    """What the networks see besides the observation."""
 
 
 class SacConfig(Settings):
@@ -185,8 +194,6 @@ class SacConfig(Settings):
     """Transitions per update."""
     buffer_size: PositiveInt = 1_000_000
     """Transitions that the replay buffer holds."""
-    discount: Annotated[float, Field(ge=0, lt=1)] = 0.99
-    """gamma, per environment step."""
     n_step: PositiveInt = 1
     """Rewards summed before the critic's own estimate takes over."""
     soft_update: Fraction = 0.005
@@ -216,17 +223,21 @@ class PhaseConfig(Settings):
     """Weight of the zone penalty."""
     zone_tightening_deg: Ramp = constant(0.0)
     """How much wider than it is the penalty sees the zone [deg]."""
+    zone_steepness: Ramp = constant(1.0)
+    """Factor on alpha, the decay of the zone penalty; larger keeps the penalty closer to the zone's edge."""
     effort_weight: Ramp = constant(0.0)
     """Cost per step of the squared action, beyond the paper's reward."""
+    discount: Ramp = constant(0.99)
+    """gamma, per environment step."""
     learning_rate: Ramp = constant(1e-4)
     """Learning rate of all networks."""
 
     @model_validator(mode="after")
-    def _angles_in_range(self) -> Self:
-        for name in ("min_angle_deg", "max_angle_deg"):
+    def _in_range(self) -> Self:
+        for name, (low, high) in _RAMP_BOUNDS.items():
             for _, value in getattr(self, name):
-                if not 0 <= value <= 180:
-                    raise ValueError(f"{name} must stay in [0, 180]; got {value}")
+                if not low <= value <= high:
+                    raise ValueError(f"{name} must stay in [{low}, {high}]; got {value}")
         fractions = {fraction for ramp in (self.min_angle_deg, self.max_angle_deg) for fraction, _ in ramp}
         for fraction in sorted(fractions):
             low, high = (ramp_value(ramp, fraction) for ramp in (self.min_angle_deg, self.max_angle_deg))
@@ -234,11 +245,20 @@ class PhaseConfig(Settings):
                 raise ValueError(
                     f"min_angle_deg must not exceed max_angle_deg; at {fraction} of the phase they are {low} and {high}"
                 )
-        for name, lowest in (("angle_bias", 1e-3), ("zone_weight", 0.0), ("effort_weight", 0.0), ("learning_rate", 0.0)):
-            for _, value in getattr(self, name):
-                if value < lowest:
-                    raise ValueError(f"{name} must be at least {lowest}; got {value}")
         return self
+
+
+_RAMP_BOUNDS = {
+    "min_angle_deg": (0.0, 180.0),
+    "max_angle_deg": (0.0, 180.0),
+    "angle_bias": (1e-3, 1e3),
+    "zone_weight": (0.0, 1e6),
+    "zone_tightening_deg": (0.0, 90.0),
+    "zone_steepness": (1e-3, 1e3),
+    "effort_weight": (0.0, 1e6),
+    "discount": (0.0, 0.99999),
+    "learning_rate": (0.0, 1.0),
+}
 
 
 def ramp_value(ramp: Ramp, fraction: float) -> float:
@@ -251,12 +271,58 @@ class CurriculumConfig(Settings):
     """The two phases of training: without and with the zone penalty."""
 
     phase1: PhaseConfig
+    """Turning fast and precisely, without a zone."""
     phase2: PhaseConfig
+    """Turning around the zone; begins with the best agent of phase 1."""
 
     @property
     def updates(self) -> int:
         """Length of the whole training."""
         return self.phase1.updates + self.phase2.updates
+
+
+class RefineConfig(Settings):
+    """Last stage: polish the policy by first-order gradients through the dynamics, over whole maneuvers."""
+
+    iterations: NonNegativeInt = 0
+    """Gradient steps; 0 leaves the stage out."""
+    scenarios: PositiveInt = 128
+    """Maneuvers per gradient step."""
+    horizon_seconds: PositiveFloat = 30.0
+    """Length of each maneuver [s]."""
+    learning_rate: PositiveFloat = 1e-3
+    """Learning rate at the start; it falls to zero along a cosine."""
+    max_gradient_norm: PositiveFloat = 1.0
+    """Larger gradients are scaled down to this norm."""
+    min_angle_deg: DeviationDeg = 30.0
+    """Smallest initial deviation [deg]."""
+    max_angle_deg: DeviationDeg = 180.0
+    """Largest initial deviation [deg]."""
+    pointing_scales_deg: tuple[PositiveFloat, ...] = (0.1, 3.0, 50.0)
+    """Scales of the pointing cost, sum of weight tanh(phi / scale) [deg]."""
+    pointing_weights: tuple[NonNegativeFloat, ...] = (4.0, 6.0, 1.0)
+    """Weight of each scale of the pointing cost, per step."""
+    effort_weight: NonNegativeFloat = 5.0
+    """Cost per step of the squared action: trades effort against time."""
+    zone_weight: NonNegativeFloat = 2.0
+    """Weight of the zone penalty."""
+    zone_tightening_deg: NonNegativeFloat = 1.0
+    """How much wider than it is the penalty sees the zone [deg]."""
+    zone_steepness: PositiveFloat = 2.0
+    """Factor on alpha, the decay of the zone penalty."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.min_angle_deg > self.max_angle_deg:
+            raise ValueError(
+                f"min_angle_deg must be at most max_angle_deg; got {self.min_angle_deg} and {self.max_angle_deg}"
+            )
+        if len(self.pointing_scales_deg) != len(self.pointing_weights):
+            raise ValueError(
+                "pointing_scales_deg and pointing_weights must have the same length; got"
+                f" {self.pointing_scales_deg} and {self.pointing_weights}"
+            )
+        return self
 
 
 class TrainConfig(Settings):
@@ -265,9 +331,15 @@ class TrainConfig(Settings):
     preset: str = "custom"
     """Settings to begin from: fast or paper; every other flag changes one of them."""
     task: TaskConfig = TaskConfig()
+    """What is learned."""
     network: NetworkConfig = NetworkConfig()
+    """What learns it."""
     sac: SacConfig = SacConfig()
+    """How it learns."""
     curriculum: CurriculumConfig
+    """In what order it learns."""
+    refine: RefineConfig = RefineConfig()
+    """How the result is polished."""
     num_envs: PositiveInt = 1
     """Environments that run in parallel."""
     updates_per_step: PositiveInt = 1
@@ -280,19 +352,33 @@ class TrainConfig(Settings):
     """Updates between evaluations and checkpoints; a phase ends with an evaluation in any case."""
     log_every: PositiveInt = 1000
     """Updates between lines of the log; also how long an interrupt may have to wait."""
+    refine_log_every: PositiveInt = 20
+    """Refinement iterations between lines of the log."""
+    refine_eval_every: PositiveInt = 100
+    """Refinement iterations between evaluations and checkpoints."""
     eval_cases: PositiveInt = 1000
     """Fixed scenarios of each evaluation."""
     eval_min_angle_deg: DeviationDeg = 80.0
     """Smallest initial deviation in evaluation [deg]."""
     eval_max_angle_deg: DeviationDeg = 180.0
     """Largest initial deviation in evaluation [deg]."""
-    seed: NonNegativeInt = 0
+    seed: Seed = 0
     """Seed of everything random in the run."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if self.curriculum.updates == 0:
             raise ValueError("curriculum must have at least one update in phase1.updates + phase2.updates; got 0")
+        if self.curriculum.updates >= 2**31:
+            raise ValueError(
+                "curriculum must have less than 2^31 updates in phase1.updates + phase2.updates; got"
+                f" {self.curriculum.updates}"
+            )
+        if self.refine.iterations and not self.curriculum.phase2.updates:
+            raise ValueError(
+                "refine.iterations must be 0 where curriculum.phase2.updates is 0: refinement polishes the agent of"
+                f" phase 2; got {self.refine.iterations}"
+            )
         if self.sac.batch_size > self.sac.buffer_size:
             raise ValueError(
                 f"sac.batch_size must be at most sac.buffer_size; got {self.sac.batch_size} and {self.sac.buffer_size}"
@@ -303,20 +389,20 @@ class TrainConfig(Settings):
                 f" environments; got {self.sac.buffer_size}"
             )
         if self.prefill_steps < self.sac.n_step:
-            raise ValueError(
-                f"prefill_steps must be at least sac.n_step = {self.sac.n_step}; got {self.prefill_steps}"
-            )
-        for name in ("curriculum.phase1.updates", "curriculum.phase2.updates", "eval_every", "log_every"):
-            value = self
-            for part in name.split("."):
-                value = getattr(value, part)
+            raise ValueError(f"prefill_steps must be at least sac.n_step = {self.sac.n_step}; got {self.prefill_steps}")
+        lengths = {
+            "curriculum.phase1.updates": self.curriculum.phase1.updates,
+            "curriculum.phase2.updates": self.curriculum.phase2.updates,
+            "eval_every": self.eval_every,
+            "log_every": self.log_every,
+        }
+        for name, value in lengths.items():
             if value % self.updates_per_step:
-                raise ValueError(f"{name} must be a multiple of updates_per_step = {self.updates_per_step}; got {value}")
-        if self.training_episode_steps < 1:
-            raise ValueError(
-                "training_episode_seconds must hold at least one step of"
-                f" {self.task.step_seconds} s; got {self.training_episode_seconds}"
-            )
+                raise ValueError(
+                    f"{name} must be a multiple of updates_per_step = {self.updates_per_step}; got {value}"
+                )
+        _check_steps("training_episode_seconds", self.training_episode_seconds, self.task.step_seconds)
+        _check_steps("refine.horizon_seconds", self.refine.horizon_seconds, self.task.step_seconds)
         if self.eval_min_angle_deg > self.eval_max_angle_deg:
             raise ValueError(
                 "eval_min_angle_deg must be at most eval_max_angle_deg; got"
@@ -325,9 +411,19 @@ class TrainConfig(Settings):
         return self
 
     @property
+    def length(self) -> int:
+        """Length of the run: gradient updates, then refinement iterations."""
+        return self.curriculum.updates + self.refine.iterations
+
+    @property
     def training_episode_steps(self) -> int:
         """Steps after which a training episode is truncated."""
         return round(self.training_episode_seconds / self.task.step_seconds)
+
+    @property
+    def refine_steps(self) -> int:
+        """Steps of a maneuver in refinement."""
+        return round(self.refine.horizon_seconds / self.task.step_seconds)
 
     @property
     def buffer_steps(self) -> int:

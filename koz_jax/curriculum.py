@@ -6,11 +6,10 @@ import numpy as np
 from flax import struct
 
 from koz_jax.config import CurriculumConfig, PhaseConfig, Ramp
-from koz_jax.reward import PAPER_WEIGHTS, RewardTerms
+from koz_jax.reward import PAPER_WEIGHTS, RewardParams, RewardTerms
 
 
-@struct.dataclass
-class Difficulty:
+class Difficulty(struct.PyTreeNode):
     """What training looks like at one step."""
 
     phase: jax.Array  # () int32, 1 or 2
@@ -19,7 +18,9 @@ class Difficulty:
     angle_bias: jax.Array  # () exponent; see ScenarioRanges
     zone_weight: jax.Array  # () factor on the zone penalty
     zone_tightening: jax.Array  # () [rad] how much wider than it is the penalty sees the zone
+    zone_steepness: jax.Array  # () factor on the decay of the zone penalty
     effort_weight: jax.Array  # () cost of the squared action
+    discount: jax.Array  # () gamma, per environment step
     learning_rate: jax.Array  # ()
 
 
@@ -37,6 +38,11 @@ def reward_weights(at: Difficulty) -> RewardTerms:
     return PAPER_WEIGHTS.replace(zone=at.zone_weight, effort=at.effort_weight)
 
 
+def reward_params(at: Difficulty, params: RewardParams) -> RewardParams:
+    """Constants of the reward in training: the zone's edge and slope by the curriculum, the rest as given."""
+    return params.replace(zone_tightening=at.zone_tightening, zone_decay=params.zone_decay * at.zone_steepness)
+
+
 def _phase_difficulty(phase: PhaseConfig, number: int, update: jax.Array) -> Difficulty:
     fraction = jnp.clip(update / max(phase.updates, 1), 0.0, 1.0)
 
@@ -51,6 +57,8 @@ def _phase_difficulty(phase: PhaseConfig, number: int, update: jax.Array) -> Dif
         angle_bias=value(phase.angle_bias),
         zone_weight=value(phase.zone_weight),
         zone_tightening=jnp.deg2rad(value(phase.zone_tightening_deg)),
+        zone_steepness=value(phase.zone_steepness),
         effort_weight=value(phase.effort_weight),
+        discount=value(phase.discount),
         learning_rate=value(phase.learning_rate),
     )

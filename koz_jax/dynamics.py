@@ -7,8 +7,7 @@ from flax import struct
 from koz_jax import rotations
 
 
-@struct.dataclass
-class Spacecraft:
+class Spacecraft(struct.PyTreeNode):
     """Physical parameters of one spacecraft; traced, so they can be vmapped and randomised."""
 
     inertia_B: jax.Array  # (3, 3) [kg m^2], symmetric positive definite, in body axes
@@ -16,8 +15,7 @@ class Spacecraft:
     torque_limit: jax.Array  # () [N m], largest torque about each body axis
 
 
-@struct.dataclass
-class RigidBodyState:
+class RigidBodyState(struct.PyTreeNode):
     """Attitude and rate of the body."""
 
     q_BN: jax.Array  # (4,) unit quaternion, body relative to inertial

@@ -10,8 +10,7 @@ from koz_jax.reward import Outcome, RewardParams
 from koz_jax.scenario import Scenario
 
 
-@struct.dataclass
-class EnvParams:
+class EnvParams(struct.PyTreeNode):
     """Everything physical about the task; traced."""
 
     spacecraft: Spacecraft
@@ -19,8 +18,7 @@ class EnvParams:
     dt: jax.Array  # () [s]
 
 
-@struct.dataclass
-class EnvState:
+class EnvState(struct.PyTreeNode):
     """A maneuver under way."""
 
     body: RigidBodyState
@@ -74,8 +72,6 @@ def step(state: EnvState, action: jax.Array, params: EnvParams) -> tuple[EnvStat
         angle_previous=state.angle,
         torque=rotations.norm(torque_B),
         torque_change=change,
-        zone_margin=keep_out.smallest_margin(
-            boresight_N(next_state.body, params.spacecraft), state.scenario.zones
-        ),
+        zone_margin=keep_out.smallest_margin(boresight_N(next_state.body, params.spacecraft), state.scenario.zones),
     )
     return next_state, outcome

@@ -1,4 +1,8 @@
-"""Errors that a user can act on.  The command lines print them without a traceback."""
+"""Errors that a user can act on, and how the command lines show them: a line each, without a traceback."""
+
+import reprlib
+import sys
+from collections.abc import Callable
 
 from pydantic import ValidationError
 
@@ -14,6 +18,19 @@ def explain(error: ValidationError) -> str:
         name = ".".join(str(part) for part in problem["loc"])
         message = problem["msg"].removeprefix("Value error, ")
         # Checks over several fields carry the whole section as input, and name the values in their message.
-        value = "" if isinstance(problem["input"], dict) or not name else f" (got {problem['input']!r})"
+        value = "" if isinstance(problem["input"], dict) or not name else f" (got {reprlib.repr(problem['input'])})"
         lines.append(f"{name}: {message}{value}" if name else message)
     return "\n".join(lines)
+
+
+def exit_status(command: Callable[[], int]) -> int:
+    """Run a command line.  Returns its exit status: 2 after an error of the user, 130 after Ctrl-C."""
+    try:
+        return command()
+    except (ValidationError, UserError) as error:
+        message = explain(error) if isinstance(error, ValidationError) else str(error)
+        print("\n".join(f"error: {line}" for line in message.splitlines()), file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130

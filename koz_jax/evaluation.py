@@ -40,9 +40,9 @@ class MonteCarloConfig:
     substeps: int = 1  # the zone is checked at so many instants per time step
 
     def __post_init__(self) -> None:
-        _require(self.cases > 0, "cases", self.cases, "at least 1")
+        _require(0 < self.cases < 2**31, "cases", self.cases, "from 1 to 2^31 - 1")
         _require(0 <= self.seed < 2**32, "seed", self.seed, "from 0 to 2^32 - 1")
-        _require(self.substeps > 0, "substeps", self.substeps, "at least 1")
+        _require(0 < self.substeps <= 100, "substeps", self.substeps, "from 1 to 100")
         _require(0 <= self.min_angle_deg <= 180, "min_angle_deg", self.min_angle_deg, "in [0, 180]")
         _require(
             self.min_angle_deg <= self.max_angle_deg <= 180,
@@ -68,21 +68,22 @@ class MonteCarlo:
     wall_s: float  # [s] flying
 
 
-def check_feasible(task_config: TaskConfig, max_angle_deg: float) -> None:
+def check_feasible(task_config: TaskConfig, max_angle_deg: float, name: str = "max_angle_deg") -> None:
     """Refuse a deviation range in which ``resample`` could draw for ever.
 
-    The boresight is at most half the deviation away from the zone's axis at start and target.
+    The boresight is at most half the deviation away from the zone's axis at start and target.  name: the setting that
+    gave ``max_angle_deg``, for the message.
     """
     needed = 2.0 * (task_config.scenario.min_half_angle_deg + task_config.scenario.separation_deg)
     if task_config.scenario.infeasible_zone == "resample" and max_angle_deg <= needed:
         raise UserError(
-            f"max_angle_deg: must be above {needed:g} deg, so that a zone fits between start and target under the rule"
+            f"{name}: must be above {needed:g} deg, so that a zone fits between start and target under the rule"
             f" 'resample'; got {max_angle_deg:g}. The rule 'shrink' leaves such zones out."
         )
 
 
 def draw_case(task_config: TaskConfig, config: MonteCarloConfig, case: jax.Array) -> Scenario:
-    """The scenario of one case.  case: () int, its index."""
+    """Draw the scenario of one case.  case: () int, its index."""
     key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), _PURPOSE), case)
     ranges = task.scenario_ranges(task_config.scenario, config.min_angle_deg, config.max_angle_deg)
     boresight_B = jnp.array(task_config.spacecraft.boresight)
@@ -91,7 +92,12 @@ def draw_case(task_config: TaskConfig, config: MonteCarloConfig, case: jax.Array
 
 @functools.partial(jax.jit, static_argnames=("task_config", "config", "mesh"))
 def _fly_cases(
-    controller: Controller, params: EnvParams, cases: jax.Array, task_config: TaskConfig, config: MonteCarloConfig, mesh: Mesh
+    controller: Controller,
+    params: EnvParams,
+    cases: jax.Array,
+    task_config: TaskConfig,
+    config: MonteCarloConfig,
+    mesh: Mesh,
 ) -> CaseResult:
     """cases: (devices * chunks * chunk,) int32 indices.  Returns leaves of the same length."""
 
@@ -141,7 +147,7 @@ def run_cases(agent: Agent, task_config: TaskConfig, config: MonteCarloConfig) -
 
 
 def report(flown: MonteCarlo, summary: Summary) -> dict[str, float | int | str | None]:
-    """The results as a JSON object (keys as in the documentation of ``eval_mc.py``); nan becomes null."""
+    """Put the results into a JSON object (keys as in the documentation of ``eval_mc.py``); nan becomes null."""
     rows = {name: None if math.isnan(value) else value for name, value in vars(summary).items()}
     return {
         "cases": flown.config.cases,
@@ -188,5 +194,3 @@ def _fly_and_judge(
 ) -> tuple[rollout.History, CaseResult]:
     history = rollout.fly(controller, drawn, params, steps)
     return history, rollout.run_case(controller, drawn, params, steps, substeps)
-
-

@@ -1,7 +1,8 @@
 """Ctrl-C and SIGTERM ask a run to stop at the next safe point; a second one aborts at once."""
 
+import contextlib
+import os
 import signal
-import sys
 import threading
 from types import FrameType
 from typing import Self
@@ -32,4 +33,6 @@ class StopRequest:
         for restored in _SIGNALS:
             signal.signal(restored, signal.SIG_DFL)
         name = signal.Signals(number).name
-        print(f"\n{name}: finishing the chunk, then checkpointing; again to abort at once", file=sys.stderr)
+        # Not print: the signal may have come while sys.stderr was being written to, which may not be entered again.
+        with contextlib.suppress(OSError):
+            os.write(2, f"\n{name}: finishing the chunk, then checkpointing; again to abort at once\n".encode())

@@ -10,8 +10,7 @@ from koz_jax import rotations
 NO_ZONE_HALF_ANGLE = -jnp.pi
 
 
-@struct.dataclass
-class KeepOutZone:
+class KeepOutZone(struct.PyTreeNode):
     """One bright cone, or a stack of them along a leading axis."""
 
     axis_N: jax.Array  # (3,) unit vector to the bright object, in inertial axes (n_F of the paper)

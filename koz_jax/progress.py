@@ -10,14 +10,18 @@ from koz_jax.summary import Summary
 
 
 class Progress:
-    """Updates done, updates per second, time left, and the last evaluation."""
+    """Updates (then refinement iterations) done, their rate, time left, and the last evaluation."""
 
-    def __init__(self, config: TrainConfig, updates: int, *, enabled: bool) -> None:
-        """Show the bar at ``updates`` done."""
-        self._phase1 = config.curriculum.phase1.updates
+    def __init__(self, config: TrainConfig, done: int, *, enabled: bool) -> None:
+        """Show the bar with ``done`` updates and refinement iterations done."""
+        self._stages = (
+            (config.curriculum.phase1.updates, "phase 1"),
+            (config.curriculum.updates, "phase 2"),
+            (config.length, "refine"),
+        )
         self._bar = tqdm(
-            total=config.curriculum.updates,
-            initial=updates,
+            total=config.length,
+            initial=done,
             unit="update",
             file=sys.stderr,
             disable=not enabled,
@@ -31,14 +35,19 @@ class Progress:
     def __exit__(self, *_: object) -> None:
         self._bar.close()
 
+    def note(self, text: str) -> None:
+        """Print a line above the bar."""
+        if not self._bar.disable:
+            self._bar.write(text, file=sys.stderr)
+
     def compiling(self) -> None:
         """Say that the first chunk has to be compiled."""
         self._bar.set_description("compiling (seconds the first time, cached afterwards)")
 
-    def advance(self, updates: int) -> None:
-        """Move to ``updates`` done."""
-        self._bar.set_description("phase 1" if updates <= self._phase1 else "phase 2", refresh=False)
-        self._bar.update(updates - self._bar.n)
+    def advance(self, done: int) -> None:
+        """Move to ``done`` updates and refinement iterations."""
+        self._bar.set_description(next(name for end, name in self._stages if done <= end), refresh=False)
+        self._bar.update(done - self._bar.n)
 
     def evaluated(self, summary: Summary) -> None:
         """Show an evaluation."""

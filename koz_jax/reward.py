@@ -8,8 +8,7 @@ import jax.numpy as jnp
 from flax import struct
 
 
-@struct.dataclass
-class RewardParams:
+class RewardParams(struct.PyTreeNode):
     """Constants of the reward; traced."""
 
     angle_factor: jax.Array  # () phi = angle_factor * rotation angle: 1 (full angle) or 0.5 (the literal equation)
@@ -25,8 +24,7 @@ class RewardParams:
     progress_tolerance: jax.Array  # () [rad] phi may grow by less than this and still count as progress
 
 
-@struct.dataclass
-class Outcome:
+class Outcome(struct.PyTreeNode):
     """What is measured of one step; the replay buffer stores it, and the reward is a function of it."""
 
     angle: jax.Array  # () [rad] full rotation angle to the target after the step
@@ -36,8 +34,7 @@ class Outcome:
     zone_margin: jax.Array  # () [rad] margin to the nearest zone after the step
 
 
-@struct.dataclass
-class RewardTerms:
+class RewardTerms(struct.PyTreeNode):
     """One number per term, or one weight per term."""
 
     attitude: jax.Array | float

@@ -20,8 +20,7 @@ class Controller(Protocol):
         ...
 
 
-@struct.dataclass
-class CaseResult:
+class CaseResult(struct.PyTreeNode):
     """What a maneuver is judged by (section 6 of the specification; Table 4 of the paper)."""
 
     initial_angle: jax.Array  # () [rad] full rotation angle at the start
@@ -44,8 +43,7 @@ class CaseResult:
         return self.settled & ~self.violated
 
 
-@struct.dataclass
-class History:
+class History(struct.PyTreeNode):
     """A maneuver step by step; leaves have a leading axis of steps + 1, the start first."""
 
     state: EnvState
@@ -55,8 +53,7 @@ class History:
     pointing_error: jax.Array  # (steps + 1,) [rad] phi
 
 
-@struct.dataclass
-class _Tally:
+class _Tally(struct.PyTreeNode):
     state: EnvState
     reward_terms: RewardTerms
     control_effort: jax.Array

@@ -7,6 +7,8 @@ Formulas are written out by component: each sample is a handful of scalars, and 
 over the batch into one vectorised loop.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 
@@ -37,13 +39,15 @@ def normalize(v: jax.Array) -> jax.Array:
 
 
 def norm(v: jax.Array) -> jax.Array:
-    """Euclidean norm of the first axis.  v: (n,).  Returns ()."""
-    return jnp.sqrt(sum(component * component for component in v))
+    """Euclidean norm of the first axis, differentiable also at zero (where the gradient is zero).  v: (n,)."""
+    squared = dot(v, v)
+    is_zero = squared == 0.0
+    return jnp.where(is_zero, 0.0, jnp.sqrt(jnp.where(is_zero, 1.0, squared)))
 
 
 def dot(a: jax.Array, b: jax.Array) -> jax.Array:
     """Scalar product.  a, b: (n,).  Returns ()."""
-    return sum(x * y for x, y in zip(a, b, strict=True))
+    return functools.reduce(jnp.add, a * b)
 
 
 def cross(a: jax.Array, b: jax.Array) -> jax.Array:

@@ -17,8 +17,7 @@ from koz_jax.keep_out import NO_ZONE_HALF_ANGLE, KeepOutZone
 InfeasibleRule = Literal["resample", "shrink"]
 
 
-@struct.dataclass
-class ScenarioRanges:
+class ScenarioRanges(struct.PyTreeNode):
     """Distribution of the scenarios; traced, because the curriculum changes it."""
 
     min_angle: jax.Array  # () [rad] smallest initial deviation
@@ -30,8 +29,7 @@ class ScenarioRanges:
     separation: jax.Array  # () [rad] between the zone's edge and the boresight at start and target
 
 
-@struct.dataclass
-class Scenario:
+class Scenario(struct.PyTreeNode):
     """One maneuver to fly."""
 
     initial: RigidBodyState
@@ -39,8 +37,7 @@ class Scenario:
     zones: KeepOutZone  # stacked along a leading axis (zones,)
 
 
-@struct.dataclass
-class _Draw:
+class _Draw(struct.PyTreeNode):
     q_e: jax.Array  # (4,) attitude relative to the target
     omega_BN_B: jax.Array  # (3,) [rad/s]
     zone_axis_D: jax.Array  # (3,) zone axis in target axes

@@ -1,91 +1,153 @@
-"""Files that are whole or not there: arrays with checksums and JSON, written atomically, read without executing code."""
+"""Files that are whole or not there: checked arrays and JSON, written atomically, read without executing code."""
 
+import contextlib
 import hashlib
 import json
 import os
 import shutil
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from flax import serialization, traverse_util
 
 from koz_jax.errors import UserError
 
 FORMAT = 1
 
+_FILES = {"arrays.npz", "record.json"}
+
+
+def check_writable(name: str, path: Path) -> None:
+    """Refuse a file that cannot be written, before the work whose results it is for.
+
+    Raises:
+        UserError: it cannot; the message begins with ``name``, the setting that gave the path.
+
+    """
+    try:
+        if path.exists() and not path.is_file():
+            raise UserError(f"{name}: {path} must be a new or an ordinary file")
+        if not path.parent.is_dir():
+            raise UserError(f"{name}: the folder {path.parent} of {path} does not exist")
+        probe = _temporary(path)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise UserError(f"{name}: {path} cannot be written: {error.strerror or error}") from None
+
 
 def write_text(path: Path, text: str) -> None:
     """Write a file in one step: readers see the old content or the new, never a part."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fresh = path.with_name(f".{path.name}.{os.getpid()}")
-    with open(fresh, "w") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(fresh, path)
+    fresh = _temporary(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(fresh, "w", encoding="utf-8", newline="\n") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(fresh, path.resolve())
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror or error}") from error
+    finally:
+        with contextlib.suppress(OSError):
+            fresh.unlink()
+
+
+def _temporary(path: Path) -> Path:
+    """Where to write what will replace a file: beside it, on the same disk."""
+    target = path.resolve()
+    return target.with_name(f".{target.name}.{os.getpid()}")
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write a JSON file in one step."""
-    write_text(path, json.dumps(content, indent=2) + "\n")
+    write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON object, or say which file is not one."""
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise UserError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise UserError(f"{path}: cannot be read as JSON: {error}") from None
     if not isinstance(content, dict):
         raise UserError(f"{path}: must hold a JSON object, got {type(content).__name__}")
     return content
 
 
-def _to_arrays(tree: Any) -> dict[str, np.ndarray]:
-    def plain(leaf: Any) -> np.ndarray:
-        is_key = isinstance(leaf, jax.Array) and jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-        return np.asarray(jax.random.key_data(leaf) if is_key else leaf)
-
-    state = serialization.to_state_dict(jax.tree.map(plain, tree))
-    return traverse_util.flatten_dict(state, sep="/")  # pyright: ignore[reportReturnType]
-
-
 def save_tree(folder: Path, tree: Any, record: Mapping[str, Any]) -> None:
-    """Write a pytree and a JSON record as a folder, replacing an older one in one rename.
+    """Write a pytree and a JSON record as a folder, replacing an older one only when the new one is whole.
 
     The folder holds ``arrays.npz`` and ``record.json``; the record gains the format number and the arrays' checksum.
+
+    Raises:
+        UserError: the folder cannot be written, or holds something else that would be lost.
+
     """
-    fresh, old = (folder.with_name(f".{folder.name}.{state}") for state in ("new", "old"))
-    for left_over in (fresh, old):
-        shutil.rmtree(left_over, ignore_errors=True)
-    fresh.mkdir(parents=True)
+    fresh, old = _sibling(folder, "new"), _sibling(folder, "old")
     try:
+        if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - _FILES):
+            raise UserError(
+                f"{folder}: holds something else than {' and '.join(sorted(_FILES))}; choose another folder"
+            )
+        if not folder.exists() and old.is_dir():
+            os.replace(old, folder)  # a crash came between the two renames of _put_in_place
+        for left_over in (fresh, old):
+            shutil.rmtree(left_over, ignore_errors=True)
+        fresh.mkdir(parents=True)
         with open(fresh / "arrays.npz", "wb") as file:
             np.savez(file, allow_pickle=False, **_to_arrays(tree))
             file.flush()
             os.fsync(file.fileno())
         digest = _sha256(fresh / "arrays.npz")
         write_json(fresh / "record.json", {"format": FORMAT, **record, "arrays_sha256": digest})
-        if folder.exists():
-            os.replace(folder, old)
-        os.replace(fresh, folder)
-        shutil.rmtree(old, ignore_errors=True)
-    except BaseException:
+        _put_in_place(fresh, folder, old)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be written: {error.strerror or error}") from error
+    finally:
         shutil.rmtree(fresh, ignore_errors=True)
+
+
+def _put_in_place(fresh: Path, folder: Path, old: Path) -> None:
+    if folder.exists():
+        os.replace(folder, old)
+    try:
+        os.replace(fresh, folder)
+    except OSError:
+        if old.exists():
+            os.replace(old, folder)
         raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _sibling(folder: Path, state: str) -> Path:
+    return folder.with_name(f".{folder.name}.{state}")
+
+
+def _whole(folder: Path) -> Path:
+    """Find the folder, or its predecessor where a crash came between the two renames of ``_put_in_place``."""
+    old = _sibling(folder, "old") if folder.name else folder
+    return old if os.path.isdir(old) and not os.path.exists(folder) else folder
+
+
+def is_saved(folder: Path) -> bool:
+    """Whether a folder is one of ``save_tree``; also for paths that cannot exist."""
+    return os.path.isfile(_whole(folder) / "record.json")
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """The JSON record of a saved folder, its format checked."""
-    record = read_json(folder / "record.json")
+    """Read the JSON record of a saved folder and check its format."""
+    path = _whole(folder) / "record.json"
+    record = read_json(path)
     if record.get("format") != FORMAT:
-        raise UserError(f"{folder / 'record.json'}: format must be {FORMAT}, got {record.get('format')!r}")
+        raise UserError(f"{path}: format must be {FORMAT}, got {record.get('format')!r}")
     return record
 
 
@@ -94,45 +156,64 @@ def load_tree(folder: Path, template: Any) -> Any:
 
     Raises:
         UserError: the arrays are missing, damaged, or do not have the names, shapes and types of the template.
+
     """
-    path = folder / "arrays.npz"
+    path = _whole(folder) / "arrays.npz"
     expected = read_record(folder).get("arrays_sha256")
     if not path.is_file():
         raise UserError(f"{path}: no such file")
     if _sha256(path) != expected:
         raise UserError(f"{path}: damaged: its checksum is not the one in record.json")
+    return _from_arrays(_read_arrays(path), template, path)
+
+
+def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        content = np.load(path, allow_pickle=False)
+        if not isinstance(content, np.lib.npyio.NpzFile):
+            raise ValueError("it is no archive of arrays")
+        with content as file:
             arrays = {name: file[name] for name in file.files}
-    except (ValueError, OSError, zipfile.BadZipFile) as error:
+        # What is no array inside the archive comes back as bytes.
+        if not all(isinstance(array, np.ndarray) for array in arrays.values()):
+            raise ValueError("the archive holds other things than arrays")
+        return arrays
+    except (ValueError, OSError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(f"{path}: cannot be read as arrays: {error}") from None
-    return _from_arrays(arrays, template, path)
+
+
+def _named_leaves(tree: Any) -> dict[str, Any]:
+    """Leaves by their path in the tree, such as ``learner/policy/params/kernel``."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+
+
+def _is_key(leaf: Any) -> bool:
+    return hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _to_arrays(tree: Any) -> dict[str, np.ndarray]:
+    """Arrays to store by name; typed PRNG keys as their data."""
+    return {
+        name: np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+        for name, leaf in _named_leaves(tree).items()
+    }
 
 
 def _from_arrays(arrays: dict[str, np.ndarray], template: Any, path: Path) -> Any:
-    def is_key(leaf: Any) -> bool:
-        return jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-    def stored(leaf: Any) -> Any:
-        return jax.eval_shape(jax.random.key_data, leaf) if is_key(leaf) else leaf
-
-    plain = jax.tree.map(stored, template)
-    wanted = traverse_util.flatten_dict(serialization.to_state_dict(plain), sep="/")
+    wanted = _named_leaves(template)
     if wanted.keys() != arrays.keys():
         missing, extra = sorted(wanted.keys() - arrays.keys()), sorted(arrays.keys() - wanted.keys())
         raise UserError(f"{path}: holds other arrays than expected: missing {missing[:3]}, unexpected {extra[:3]}")
+    leaves = []
     for name, leaf in wanted.items():
+        stored = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
         found = arrays[name]
-        if found.shape != leaf.shape or found.dtype != leaf.dtype:
-            raise UserError(
-                f"{path}: {name} must be {leaf.dtype}{leaf.shape}, got {found.dtype}{found.shape}"
-            )
-    tree = serialization.from_state_dict(plain, traverse_util.unflatten_dict(arrays, sep="/"))
-    return jax.tree.map(
-        lambda leaf, value: jax.random.wrap_key_data(value) if is_key(leaf) else jax.numpy.asarray(value),
-        template,
-        tree,
-    )
+        if found.shape != stored.shape or found.dtype != stored.dtype:
+            raise UserError(f"{path}: {name} must be {stored.dtype}{stored.shape}, got {found.dtype}{found.shape}")
+        array = jnp.asarray(found)
+        leaves.append(jax.random.wrap_key_data(array) if _is_key(leaf) else array)
+    return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 
 def _sha256(path: Path) -> str:

@@ -1,28 +1,27 @@
 """The host loop of training: chunks, evaluation, best agents, checkpoints, logs, interrupts."""
 
+import math
 import shlex
 import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import koz_jax
-from koz_jax import curriculum, evaluation, reward, training
+from koz_jax import curriculum, evaluation, refine, reward, training
 from koz_jax.agent import Agent, PolicyController, Provenance
 from koz_jax.config import TrainConfig
 from koz_jax.errors import UserError
+from koz_jax.evaluation import MonteCarloConfig
 from koz_jax.interrupt import StopRequest
 from koz_jax.metrics_log import MetricsLog, flatten
-from koz_jax.evaluation import MonteCarloConfig
 from koz_jax.progress import Progress
 from koz_jax.rollout import CaseResult
-from koz_jax.run_folder import RunFolder, RunState, load_state, save_state
-from koz_jax.sac.learner import LearnerState
+from koz_jax.run_folder import RunFolder, RunState, load_checkpoint, load_source, save_state
 from koz_jax.summary import Summary, summarise
 from koz_jax.training import TrainState
 
@@ -49,55 +48,53 @@ def train(
 
     Returns:
         The best agent of the last phase, or None if the run was interrupted (its checkpoint is then up to date).
+
+    Raises:
+        UserError: the settings ask for the impossible, or a folder is not what it should be; nothing was written.
+
     """
+    if resume and start_from is not None:
+        raise UserError(f"start_from: a resumed run goes on from its own checkpoint, got {start_from}")
     folder = RunFolder(Path(run))
-    if not resume:
-        evaluation.check_feasible(config.task, config.eval_max_angle_deg)
-        source = None if start_from is None else _checked_source(Path(start_from), config)
-        folder.create(config)
-        state = _begin(config, source)
-    else:
-        state = load_state(folder.checkpoint, _template(config))
-    with Progress(config, int(state.train.updates), enabled=progress) as bar, StopRequest() as stop:
-        return _Run(config, folder, bar, stop).go(state)
+    with StopRequest() as stop:
+        if resume:
+            state = load_checkpoint(folder, config, _template(config))
+        else:
+            evaluation.check_feasible(config.task, config.eval_max_angle_deg, "eval_max_angle_deg")
+            source = None if start_from is None else load_source(Path(start_from), config, _template(config))
+            folder.create(config)
+            state = _begin(config, source)
+        with Progress(config, state.done, enabled=progress) as bar:
+            bar.note(f"run folder: {folder.path}")
+            return _Run(config, folder, bar, stop).go(state)
 
 
 def _template(config: TrainConfig) -> RunState:
     """Shapes and types of a run's state, without computing it."""
-    return jax.eval_shape(lambda: _fresh(training.init(config, jax.random.key(config.seed))))
+    return jax.eval_shape(lambda: _fresh(config, training.init(config, jax.random.key(config.seed))))
 
 
-def _fresh(state: TrainState) -> RunState:
+def _fresh(config: TrainConfig, state: TrainState) -> RunState:
+    """A phase about to begin."""
     return RunState(
         train=state,
         best=jax.tree.map(jnp.copy, state.learner),
         best_score=jnp.float32(-jnp.inf),
-        best_updates=jnp.zeros((), jnp.int32),
+        best_at=jnp.zeros((), jnp.int32),
+        refine=refine.init(config, jax.tree.map(jnp.copy, state.learner.averaged_policy)),
     )
 
 
-def _checked_source(folder: Path, config: TrainConfig) -> RunState:
-    source = folder / "checkpoint" if (folder / "checkpoint").is_dir() else folder
-    if not (source / "record.json").is_file():
-        raise UserError(f"start_from: {folder} is neither a run nor a snapshot (no record.json)")
-    return load_state(source, _template(config))
-
-
 def _begin(config: TrainConfig, source: RunState | None) -> RunState:
-    """A fresh state, or one that takes learner and replay buffer from another run."""
+    """Make a fresh state, or one that takes learner and replay buffer from another run."""
     state = training.init(config, jax.random.key(config.seed))
     if source is not None:
         state = state.replace(learner=source.train.learner, buffer=source.train.buffer)
-    return _fresh(state)
-
-
-class _Evaluation(NamedTuple):
-    score: float
-    summary: Summary
+    return _fresh(config, state)
 
 
 def score(results: CaseResult, config: TrainConfig, phase: int) -> float:
-    """What the best agent is chosen by: mean reward of the phase's end, cases that failed counting zero.
+    """Compute what the best agent is chosen by: mean reward of the phase's end, cases that failed counting zero.
 
     In phase 1, which knows no zone, a case fails by not settling; in phase 2 also by violating the zone.
     """
@@ -116,97 +113,133 @@ class _Run:
         self.folder = folder
         self.bar = bar
         self.stop = stop
-        phase1, total = config.curriculum.phase1.updates, config.curriculum.updates
-        self.phase_ends = {end for end in (phase1, total) if end > 0}
-        self.evaluations = sorted({*range(config.eval_every, total, config.eval_every), *self.phase_ends})
+        phase1, learned = config.curriculum.phase1.updates, config.curriculum.updates
+        self.evaluations = sorted(
+            {
+                *range(config.eval_every, learned, config.eval_every),
+                *range(learned + config.refine_eval_every, config.length, config.refine_eval_every),
+                *(end for end in (phase1, learned, config.length) if end > 0),
+            }
+        )
+        self.commit = _commit()
 
     def go(self, state: RunState) -> Agent | None:
         """Train to the end, or until asked to stop."""
-        updates = int(state.train.updates)
-        log = MetricsLog(self.folder.path, updates)
+        if state.done < self.config.length:
+            state = self._train(state)
+        if state.done < self.config.length:
+            save_state(self.folder.checkpoint, state, self.config)
+            return None
+        return self._agent(state, 2 if self.config.curriculum.phase2.updates else 1)
+
+    def _train(self, state: RunState) -> RunState:
+        """Go on chunk by chunk; log, evaluate and checkpoint on the way."""
+        log = MetricsLog(self.folder.path, state.done)
         self.bar.compiling()
+        # The first row of a log names its columns.
+        blank = dict.fromkeys(("refine/cost", *_EVAL_NAMES), math.nan)
         try:
-            while updates < self.config.curriculum.updates and not self.stop.requested:
-                state, values = self._chunk(state, updates)
-                updates = int(state.train.updates)
-                if updates in self.evaluations:
-                    state, evaluated = self._evaluate(state, updates)
-                    values |= evaluated
-                    log.write(updates, values)
+            while state.done < self.config.length and not self.stop.requested:
+                learning = state.done < self.config.curriculum.updates
+                state, measured = self._learn(state) if learning else self._refine(state)
+                values = measured | blank
+                blank = {}
+                self.bar.advance(state.done)
+                if state.done in self.evaluations:
+                    state, evaluated = self._evaluate(state)
+                    log.write(state.done, values | evaluated)
                     save_state(self.folder.checkpoint, state, self.config)
                 else:
-                    log.write(updates, values | {name: None for name in _EVAL_NAMES})
-            if updates < self.config.curriculum.updates:
-                save_state(self.folder.checkpoint, state, self.config)
-                return None
+                    log.write(state.done, values)
         finally:
             log.close()
-        return self._agent(state.best, 2 if self.config.curriculum.phase2.updates else 1, int(state.best_updates))
+        return state
 
-    def _chunk(self, state: RunState, updates: int) -> tuple[RunState, dict[str, float | None]]:
-        """Train until the next line of the log or the next evaluation."""
-        next_log = (updates // self.config.log_every + 1) * self.config.log_every
-        end = min([next_log, *(point for point in self.evaluations if point > updates)])
-        steps = (end - updates) // self.config.updates_per_step
+    def _chunk_end(self, done: int, log_every: int) -> int:
+        """Where the next chunk ends: at the next line of the log or the next evaluation."""
+        next_log = (done // log_every + 1) * log_every
+        return min([next_log, *(point for point in self.evaluations if point > done)])
+
+    def _learn(self, state: RunState) -> tuple[RunState, dict[str, float]]:
+        """One chunk of Soft Actor-Critic."""
+        done = state.done
+        end = self._chunk_end(done, self.config.log_every)
+        steps = (end - done) // self.config.updates_per_step
         start = time.perf_counter()
         train_state, metrics = training.train_chunk(self.config, state.train, jnp.int32(steps))
         metrics = jax.device_get(metrics)
         seconds = time.perf_counter() - start
-        self.bar.advance(end)
-        at = jax.device_get(_difficulty(self.config, end))
-        values: dict[str, float | None] = {
+        at = curriculum.difficulty(self.config.curriculum, jnp.int32(end))
+        values = {
             "env_steps": (self.config.prefill_steps + end // self.config.updates_per_step) * self.config.num_envs,
-            "updates_per_second": (end - updates) / seconds,
+            "updates_per_second": (end - done) / seconds,
             **flatten("train", metrics.learner),
             **flatten("reward", metrics.reward),
-            **flatten("curriculum", at),
+            **flatten("curriculum", jax.device_get(at)),
         }
         return state.replace(train=train_state), values
 
-    def _evaluate(self, state: RunState, updates: int) -> tuple[RunState, dict[str, float | None]]:
-        """Judge the averaged policy, keep the best, and at the end of a phase hand it on."""
-        phase = 1 if updates <= self.config.curriculum.phase1.updates else 2
-        controller = PolicyController(state.train.learner.averaged_policy, self.config.network)
+    def _refine(self, state: RunState) -> tuple[RunState, dict[str, float]]:
+        """One chunk of refinement."""
+        done = state.done
+        end = self._chunk_end(done, self.config.refine_log_every)
+        start = time.perf_counter()
+        refined, cost = refine.refine_chunk(self.config, state.refine, jnp.int32(end - done))
+        values = {"refine/cost": float(cost), "updates_per_second": (end - done) / (time.perf_counter() - start)}
+        return state.replace(refine=refined), values
+
+    def _evaluate(self, state: RunState) -> tuple[RunState, dict[str, float]]:
+        """Judge the policy, keep the best, and at the end of a stage hand it on."""
+        done, curriculum_config = state.done, self.config.curriculum
+        phase = 1 if done <= curriculum_config.phase1.updates else 2
+        learned = done <= curriculum_config.updates
+        learner = state.train.learner if learned else state.best.replace(averaged_policy=state.refine.policy)
         cases = MonteCarloConfig(
             self.config.eval_cases, _EVAL_SEED, self.config.eval_min_angle_deg, self.config.eval_max_angle_deg
         )
+        controller = PolicyController(learner.averaged_policy, self.config.network)
         results = evaluation.fly_cases(controller, self.config.task, cases)
-        found = _Evaluation(score(results, self.config, phase), summarise(results))
-        self.bar.evaluated(found.summary)
-        if found.score > float(state.best_score):
-            state = state.replace(
-                best=jax.tree.map(jnp.copy, state.train.learner),
-                best_score=jnp.float32(found.score),
-                best_updates=jnp.int32(updates),
-            )
-            self._agent(state.best, phase, updates).save(self.folder.agent(phase))
-        if updates == self.config.curriculum.phase1.updates:
+        found, summary = score(results, self.config, phase), summarise(results)
+        self.bar.evaluated(summary)
+        if found > float(state.best_score):
+            best = jax.tree.map(jnp.copy, learner)
+            state = state.replace(best=best, best_score=jnp.float32(found), best_at=jnp.int32(done))
+            self._agent(state, phase).save(self.folder.agent(phase))
+        if done == curriculum_config.phase1.updates:
             save_state(self.folder.snapshot("phase1"), state, self.config)
-            state = _fresh(state.train.replace(learner=jax.tree.map(jnp.copy, state.best)))
-        return state, {"eval/score": found.score, **{f"eval/{k}": v for k, v in vars(found.summary).items()}}
+            if curriculum_config.phase2.updates:
+                learner = jax.tree.map(jnp.copy, state.best)
+                state = _fresh(self.config, state.train.replace(learner=learner))
+        elif done == curriculum_config.updates and self.config.refine.iterations:
+            self._agent(state, phase).save(self.folder.sac_agent)
+            policy = jax.tree.map(jnp.copy, state.best.averaged_policy)
+            state = state.replace(refine=refine.init(self.config, policy))
+        return state, {"eval/score": found, **{f"eval/{name}": value for name, value in vars(summary).items()}}
 
-    def _agent(self, learner: LearnerState, phase: int, updates: int) -> Agent:
+    def _agent(self, state: RunState, phase: int) -> Agent:
+        """The best agent of the phase so far."""
+        best_at, learned = int(state.best_at), self.config.curriculum.updates
         provenance = Provenance(
             command=shlex.join(["python", *sys.argv]),
-            commit=_commit(),
+            commit=self.commit,
             version=koz_jax.__version__,
             seed=self.config.seed,
             phase=phase,
-            updates=updates,
+            updates=min(best_at, learned),
+            refinements=max(best_at - learned, 0),
         )
-        controller = PolicyController(learner.averaged_policy, self.config.network)
+        controller = PolicyController(state.best.averaged_policy, self.config.network)
         return Agent(controller, self.config.task, provenance, str(self.folder.path))
 
 
 _EVAL_NAMES = ("eval/score", *(f"eval/{name}" for name in Summary.__dataclass_fields__))
 
 
-def _difficulty(config: TrainConfig, updates: int) -> curriculum.Difficulty:
-    return curriculum.difficulty(config.curriculum, jnp.int32(updates))
-
-
 def _commit() -> str:
     """Commit of the checkout that this code runs from, marked when it has changes; empty outside a checkout."""
     command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError:  # there is no git
+        return ""
     return done.stdout.strip() if done.returncode == 0 else ""

@@ -20,14 +20,13 @@ from koz_jax.sac.replay import ReplayBuffer, Transition
 ACTION_SIZE = 3
 
 # Training draws scenarios all the time, also at angles where no zone fits; it soon takes what it can get.
-_MAX_DRAWS = 8
+MAX_DRAWS = 8
 
 # Episodes start in so many groups, spread over an episode, so that the buffer holds all parts of a maneuver.
 _START_GROUPS = 16
 
 
-@struct.dataclass
-class TrainState:
+class TrainState(struct.PyTreeNode):
     """Everything that a resume needs."""
 
     learner: LearnerState
@@ -37,8 +36,7 @@ class TrainState:
     updates: jax.Array  # () int32, gradient updates done
 
 
-@struct.dataclass
-class TrainMetrics:
+class TrainMetrics(struct.PyTreeNode):
     """Means over a chunk of training."""
 
     learner: LearnerMetrics
@@ -72,7 +70,7 @@ def _reset_envs(config: TrainConfig, params: EnvParams, at: Difficulty, key: jax
                 ranges,
                 params.spacecraft.boresight_B,
                 config.task.scenario.infeasible_zone,
-                max_draws=_MAX_DRAWS,
+                max_draws=MAX_DRAWS,
             )
         )
 
@@ -142,13 +140,13 @@ def init(config: TrainConfig, key: jax.Array) -> TrainState:
 def _rewarded_batch(
     config: TrainConfig, params: EnvParams, buffer: ReplayBuffer, at: Difficulty, key: jax.Array
 ) -> Batch:
-    """Draw transitions and reward them as the curriculum stands now.  Returns leaves (updates_per_step * batch, ...)."""
+    """Draw transitions and reward them as the curriculum stands now.  Leaves: (updates_per_step * batch, ...)."""
     count = config.updates_per_step * config.sac.batch_size
     windows = replay.sample_windows(buffer, key, count, config.sac.n_step)
-    reward_params = params.reward.replace(zone_tightening=at.zone_tightening)
+    reward_params = curriculum.reward_params(at, params.reward)
     terms = reward.terms(windows.outcome, reward_params, params.spacecraft.torque_limit)
     rewards = config.sac.reward_scale * reward.total(terms, curriculum.reward_weights(at))
-    return replay.n_step_batch(windows, rewards, config.sac.discount)
+    return replay.n_step_batch(windows, rewards, at.discount)
 
 
 def train_step(config: TrainConfig, params: EnvParams, state: TrainState) -> tuple[TrainState, TrainMetrics]:

@@ -48,8 +48,7 @@ class Sac:
 _adam = optax.scale_by_adam()
 
 
-@struct.dataclass
-class LearnerState:
+class LearnerState(struct.PyTreeNode):
     """Everything that learning changes."""
 
     policy: Params
@@ -62,8 +61,7 @@ class LearnerState:
     alpha_optimizer: optax.OptState
 
 
-@struct.dataclass
-class LearnerMetrics:
+class LearnerMetrics(struct.PyTreeNode):
     """What an update reports."""
 
     critic_loss: jax.Array  # ()

@@ -12,8 +12,7 @@ PolicyFn = Callable[[Params, jax.Array], SquashedGaussian]
 CriticFn = Callable[[Params, jax.Array, jax.Array], jax.Array]
 
 
-@struct.dataclass
-class Batch:
+class Batch(struct.PyTreeNode):
     """Transitions to learn from, over n steps where n-step returns are used."""
 
     observation: jax.Array  # (batch, n)

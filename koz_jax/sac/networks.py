@@ -18,8 +18,7 @@ LOG_STD_MAX = 2.0
 _kernel_init = nn.initializers.variance_scaling(1.0 / 3.0, "fan_in", "uniform")
 
 
-@struct.dataclass
-class SquashedGaussian:
+class SquashedGaussian(struct.PyTreeNode):
     """Distribution of actions: the tanh of a diagonal Gaussian (arXiv:1812.05905, appendix C)."""
 
     mean: jax.Array  # (..., actions)

@@ -9,8 +9,7 @@ from flax import struct
 from koz_jax.sac.losses import Batch
 
 
-@struct.dataclass
-class Transition:
+class Transition(struct.PyTreeNode):
     """One step of one environment, before any reward is computed."""
 
     observation: jax.Array  # (n,)
@@ -21,8 +20,7 @@ class Transition:
     next_observation: jax.Array  # (n,) true observation after the step, also at the end of an episode
 
 
-@struct.dataclass
-class ReplayBuffer:
+class ReplayBuffer(struct.PyTreeNode):
     """The ring.  Leaves of ``rows`` have the leading axes (steps, environments)."""
 
     rows: Transition
@@ -59,7 +57,7 @@ def sample_windows(buffer: ReplayBuffer, key: jax.Array, count: int, length: int
     return jax.tree.map(lambda leaf: leaf[step, env], buffer.rows)
 
 
-def n_step_batch(window: Transition, reward: jax.Array, discount: float) -> Batch:
+def n_step_batch(window: Transition, reward: jax.Array, discount: jax.Array | float) -> Batch:
     """Sum the rewards of each window up to the end of its episode.
 
     window: leaves (length, count, ...); reward: (length, count); discount: gamma per step.  A window that is cut by

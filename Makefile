@@ -1,0 +1,34 @@
+# make train: set up and train.  make test: set up and test.  Both need Python >= 3.11 and nothing else.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt
+
+.PHONY: train evaluate test lint benchmark
+
+train: $(VENV)/.core
+	$(BIN)/python train.py $(ARGS)
+
+evaluate: $(VENV)/.core
+	$(BIN)/python eval_mc.py $(ARGS)
+
+test: $(VENV)/.dev
+	$(BIN)/python -m pytest $(ARGS)
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/basedpyright
+
+benchmark: $(VENV)/.core
+	$(BIN)/python benchmarks/speed.py $(ARGS)
+
+$(VENV)/.core: pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit("koz_jax needs Python 3.11 or later: set PYTHON" if sys.version_info < (3, 11) else 0)'
+	$(PYTHON) -m venv $(VENV)
+	$(PIP) --editable .
+	touch $@
+
+$(VENV)/.dev: $(VENV)/.core
+	$(PIP) --editable ".[dev]"
+	touch $@

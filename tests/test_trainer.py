@@ -1,0 +1,489 @@
+"""The host loop: what a run leaves behind, and that stopping and going on changes nothing."""
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+import tiny
+from tiny import CONFIG
+
+from koz_jax import storage, trainer, training
+from koz_jax.agent import load_agent
+from koz_jax.config import TrainConfig
+from koz_jax.errors import UserError
+from koz_jax.interrupt import StopRequest
+from koz_jax.metrics_log import MetricsLog, read_metrics
+from koz_jax.progress import Progress
+from koz_jax.run_folder import RunFolder, RunState
+from koz_jax.trainer import train
+
+# Columns that measure time.
+TIMES = {"updates_per_second"}
+
+
+@pytest.fixture(scope="module")
+def run() -> RunFolder:
+    """The undisturbed run; read it, do not change it."""
+    return tiny.finished_run()
+
+
+@pytest.fixture
+def copied(run, tmp_path) -> RunFolder:
+    """A copy of the undisturbed run, to be damaged."""
+    shutil.copytree(run.path, tmp_path / "copy")
+    return RunFolder(tmp_path / "copy")
+
+
+@pytest.fixture
+def no_compute(monkeypatch) -> None:
+    """Make an error of whatever would cost time."""
+    for name in ("init", "train_chunk"):
+        monkeypatch.setattr(training, name, lambda *_: pytest.fail("something was computed"))
+    monkeypatch.setattr(trainer.evaluation, "fly_cases", lambda *_: pytest.fail("something was flown"))
+
+
+@contextlib.contextmanager
+def signal_after(updates: int, number: signal.Signals) -> Iterator[None]:
+    """Send this process a signal when a run has done so many updates."""
+    advance = Progress.advance
+
+    def advance_and_signal(bar: Progress, at: int) -> None:
+        advance(bar, at)
+        if at == updates:
+            signal.raise_signal(number)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Progress, "advance", advance_and_signal)
+        yield
+
+
+def changed(**fields: Any) -> TrainConfig:
+    """The tiny configuration with other values in some fields (sections are replaced field by field)."""
+    content = CONFIG.model_dump()
+    for name, value in fields.items():
+        content[name] = content[name] | value if isinstance(value, dict) else value
+    return TrainConfig.model_validate(content)
+
+
+def state_of(folder: Path) -> RunState:
+    return storage.load_tree(folder, trainer._template(CONFIG))
+
+
+def assert_same_tree(found: Any, expected: Any) -> None:
+    for (path, one), (_, other) in zip(
+        jax.tree_util.tree_leaves_with_path(found), jax.tree_util.tree_leaves_with_path(expected), strict=True
+    ):
+        if jax.dtypes.issubdtype(one.dtype, jax.dtypes.prng_key):  # pyright: ignore[reportPrivateImportUsage]
+            one, other = jax.random.key_data(one), jax.random.key_data(other)
+        np.testing.assert_array_equal(one, other, err_msg=jax.tree_util.keystr(path), strict=True)
+
+
+def assert_same_metrics(found: Path, expected: Path) -> None:
+    rows, others = read_metrics(found), read_metrics(expected)
+    for row, other in zip(rows, others, strict=True):
+        assert row.keys() == other.keys()
+        assert {name: row[name] for name in row.keys() - TIMES} == {name: other[name] for name in row.keys() - TIMES}
+
+
+def assert_same_run(found: RunFolder, expected: RunFolder) -> None:
+    """Same to the last bit, but for times."""
+    assert_same_tree(state_of(found.checkpoint), state_of(expected.checkpoint))
+    assert_same_tree(state_of(found.snapshot("phase1")), state_of(expected.snapshot("phase1")))
+    assert_same_metrics(found.path / "metrics.csv", expected.path / "metrics.csv")
+    for phase in (1, 2):
+        one, other = (load_agent(folder.agent(phase)) for folder in (found, expected))
+        assert_same_tree(one.controller, other.controller)
+        assert one.provenance.updates == other.provenance.updates
+
+
+def contents(folder: Path) -> dict[Path, bytes | None]:
+    """Everything in a folder."""
+    return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
+
+
+def test_layout_of_a_run(run):
+    found = {str(path.relative_to(run.path)) for path in run.path.rglob("*") if "tensorboard/" not in str(path)}
+    saved = [
+        ("agents/phase1", "agents"),
+        ("agents/phase2", "agents"),
+        ("snapshots/phase1", "snapshots"),
+        ("checkpoint", "checkpoint"),
+    ]
+    assert found == {
+        "config.json",
+        "metrics.csv",
+        "tensorboard",
+        *(name for names in saved for name in names),
+        *(f"{folder}/{name}" for folder, _ in saved for name in ("arrays.npz", "record.json")),
+    }
+    assert any((run.path / "tensorboard").iterdir())
+    assert run.read_config() == CONFIG
+
+
+def test_metrics_have_a_row_per_chunk_and_an_evaluation_where_due(run):
+    rows = read_metrics(run.path / "metrics.csv")
+    assert [int(row["updates"]) for row in rows] == [16, 32, 48, 64, 80, 96, 112, 128]
+    assert [row["eval/success_rate"] != "" for row in rows] == [False, True] * 4
+    assert [int(row["env_steps"]) for row in rows] == [8 * (5 + updates // 2) for updates in range(16, 129, 16)]
+    assert all(np.isfinite(float(row[name])) for row in rows for name in row if name.startswith(("train/", "reward/")))
+    assert {"train/critic_loss", "reward/zone", "curriculum/max_angle", "updates_per_second"} <= rows[0].keys()
+
+
+def test_metrics_go_to_tensorboard_too(run):
+    loader = pytest.importorskip("tensorboardX.record_writer", reason="reads the file it wrote")
+    del loader
+    (events,) = (run.path / "tensorboard").iterdir()
+    content = events.read_bytes()
+    for name in (b"train/critic_loss", b"eval/success_rate", b"curriculum/zone_weight"):
+        assert name in content
+
+
+def test_agents_tell_where_they_come_from(run):
+    for phase in (1, 2):
+        agent = load_agent(run.agent(phase))
+        provenance = agent.provenance
+        assert (provenance.phase, provenance.seed) == (phase, CONFIG.seed)
+        assert provenance.updates in ({32, 64}, {96, 128})[phase - 1]
+        assert provenance.command.startswith("python ") and provenance.version
+        assert agent.task == CONFIG.task
+
+
+@pytest.mark.parametrize(("updates", "number"), [(48, signal.SIGINT), (64, signal.SIGTERM), (112, signal.SIGINT)])
+def test_a_stopped_and_resumed_run_equals_the_undisturbed_one(run, tmp_path, updates, number):
+    # 48 and 112 are between evaluations, where only the stop itself makes the checkpoint; 64 is the end of phase 1.
+    folder = RunFolder(tmp_path / "run")
+    with signal_after(updates, number):
+        assert train(CONFIG, folder.path, progress=False) is None
+    assert int(state_of(folder.checkpoint).train.updates) == updates
+    assert signal.getsignal(number) is not signal.SIG_DFL  # Python's own handling is back
+    agent = train(CONFIG, folder.path, resume=True, progress=False)
+    assert agent is not None
+    assert_same_run(folder, run)
+    assert_same_tree(agent.controller, load_agent(run.path).controller)
+
+
+def test_a_run_stopped_twice_equals_the_undisturbed_one(run, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    with signal_after(16, signal.SIGINT):
+        assert train(CONFIG, folder.path, progress=False) is None
+    with signal_after(80, signal.SIGTERM):
+        assert train(CONFIG, folder.path, resume=True, progress=False) is None
+    assert train(CONFIG, folder.path, resume=True, progress=False) is not None
+    assert_same_run(folder, run)
+
+
+def test_a_killed_run_goes_on_from_its_last_checkpoint(run, tmp_path, monkeypatch):
+    folder = RunFolder(tmp_path / "run")
+
+    def crash(*_: Any) -> None:
+        raise RuntimeError("power cut")
+
+    with signal_after(96, signal.SIGINT), monkeypatch.context() as patch:
+        # Rows 80 and 96 are in the log, but the checkpoint is that of 64.
+        saves = trainer.save_state
+
+        def save(path: Path, state: RunState, config: TrainConfig) -> None:
+            crash() if int(state.train.updates) > 64 else saves(path, state, config)
+
+        patch.setattr(trainer, "save_state", save)
+        with pytest.raises(RuntimeError, match="power cut"):
+            train(CONFIG, folder.path, progress=False)
+    assert int(state_of(folder.checkpoint).train.updates) == 64
+    assert [row["updates"] for row in read_metrics(folder.path / "metrics.csv")][-1] == "96"
+    assert train(CONFIG, folder.path, resume=True, progress=False) is not None
+    assert_same_run(folder, run)
+
+
+def test_a_signal_before_the_first_update_makes_a_checkpoint_too(run, tmp_path, monkeypatch):
+    folder = RunFolder(tmp_path / "run")
+    begin = trainer._begin
+
+    def signalled(*args: Any) -> RunState:
+        signal.raise_signal(signal.SIGTERM)
+        return begin(*args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(trainer, "_begin", signalled)
+        assert train(CONFIG, folder.path, progress=False) is None
+    assert int(state_of(folder.checkpoint).train.updates) == 0
+    assert train(CONFIG, folder.path, resume=True, progress=False) is not None
+    assert_same_run(folder, run)
+
+
+@pytest.mark.parametrize("second", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_signal_aborts_at_once(second):
+    code = (
+        "import signal\n"
+        "from koz_jax.interrupt import StopRequest\n"
+        "with StopRequest() as stop:\n"
+        "    signal.raise_signal(signal.SIGINT)\n"
+        "    print(stop.requested, flush=True)\n"
+        f"    signal.raise_signal({int(second)})\n"
+        "    print('still here', flush=True)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (-second, "True\n")
+    assert "SIGINT: finishing the chunk, then checkpointing; again to abort at once" in done.stderr
+
+
+def test_handlers_are_put_back():
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    with StopRequest() as stop:
+        assert signal.getsignal(signal.SIGINT) != before[signal.SIGINT]
+        signal.raise_signal(signal.SIGTERM)
+        assert stop.requested
+    assert {number: signal.getsignal(number) for number in before} == before
+
+
+def test_the_best_learner_of_phase_1_starts_phase_2(tmp_path, monkeypatch):
+    # The first evaluation of the phase is made to be the better one.
+    scores = iter([2.0, 1.0])
+    monkeypatch.setattr(trainer, "score", lambda *_: next(scores))
+    folder = RunFolder(tmp_path / "run")
+    with signal_after(64, signal.SIGINT):
+        assert train(CONFIG, folder.path, progress=False) is None
+    snapshot, begun = state_of(folder.snapshot("phase1")), state_of(folder.checkpoint)
+    assert (float(snapshot.best_score), int(snapshot.best_updates)) == (2.0, 32)
+    assert_same_tree(begun.train.learner, snapshot.best)
+    assert not np.array_equal(begun.train.learner.log_alpha, snapshot.train.learner.log_alpha)
+    assert_same_tree(begun.train.buffer, snapshot.train.buffer)
+    assert float(begun.best_score) == -np.inf  # phase 2 judges anew
+    agent = load_agent(folder.agent(1))
+    assert agent.provenance.updates == 32
+    assert_same_tree(agent.controller.policy, snapshot.best.averaged_policy)
+
+
+def test_a_training_of_one_phase_returns_its_best(tmp_path, monkeypatch):
+    scores = iter([2.0, 1.0])
+    monkeypatch.setattr(trainer, "score", lambda *_: next(scores))
+    config = changed(curriculum={"phase2": CONFIG.curriculum.phase2.model_dump() | {"updates": 0}})
+    folder = RunFolder(tmp_path / "run")
+    agent = train(config, folder.path, progress=False)
+    assert agent is not None
+    assert (agent.provenance.phase, agent.provenance.updates) == (1, 32)
+    assert_same_tree(agent.controller, load_agent(folder.path).controller)
+    resumed = train(config, folder.path, resume=True, progress=False)
+    assert resumed is not None and resumed.provenance.updates == 32
+
+
+def test_resuming_a_finished_run_returns_its_agent_without_training(run, copied, no_compute):
+    before = contents(copied.path)
+    agent = train(CONFIG, copied.path, resume=True, progress=False)
+    assert agent is not None
+    saved = load_agent(run.path)
+    assert_same_tree(agent.controller, saved.controller)
+    assert agent.provenance.updates == saved.provenance.updates
+    assert contents(copied.path) == before
+
+
+def test_a_used_folder_is_refused_and_stays_as_it_is(copied, tmp_path, no_compute):
+    before = contents(copied.path)
+    for resumed in (copied.path, copied.path / "agents", copied.config):
+        with pytest.raises(UserError, match="exists already"):
+            train(CONFIG, resumed, progress=False)
+    assert contents(copied.path) == before
+
+
+def test_an_empty_folder_is_used(tmp_path, monkeypatch):
+    monkeypatch.setattr(trainer, "_begin", lambda *_: pytest.skip("the folder was accepted"))
+    train(CONFIG, tmp_path, progress=False)
+    pytest.fail("the folder was not accepted")
+
+
+@pytest.mark.parametrize("parent", ["file", "x" * 300])
+def test_a_folder_that_cannot_be_made_is_named(tmp_path, no_compute, parent):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match=rf"run: {tmp_path}/{parent}/run cannot be created: "):
+        train(CONFIG, tmp_path / parent / "run", progress=False)
+
+
+def test_a_range_without_room_for_a_zone_is_refused(tmp_path, no_compute):
+    config = changed(eval_min_angle_deg=10.0, eval_max_angle_deg=30.0)
+    with pytest.raises(UserError, match=r"eval_max_angle_deg: must be above 34 deg.*'resample'; got 30"):
+        train(config, tmp_path / "run", progress=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_no_run_is_not_resumed(tmp_path, no_compute):
+    with pytest.raises(UserError, match="is not a run folder"):
+        RunFolder(tmp_path).read_config()
+    with pytest.raises(UserError, match=f"resume: {tmp_path} has no checkpoint"):
+        train(CONFIG, tmp_path, resume=True, progress=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_keeps_its_settings(copied, no_compute):
+    before = contents(copied.path)
+    other = changed(sac={"reward_scale": 0.5})
+    with pytest.raises(UserError, match=r"resume: sac.reward_scale is 0.5, but .*copy was begun with 1.0; a run keeps"):
+        train(other, copied.path, resume=True, progress=False)
+    with pytest.raises(UserError, match=r"resume: network.hidden_sizes is \(16, 8\), but"):
+        train(changed(network={"hidden_sizes": (16, 8)}), copied.path, resume=True, progress=False)
+    assert contents(copied.path) == before
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("", "cannot be read as JSON"),
+        ("[]", "must hold a JSON object, got list"),
+        ("{}", "curriculum: Field required"),
+        ('{"num_envs": 0}', "num_envs: Input should be greater than 0 (got 0)"),
+        ('{"colour": "red"}', "colour: Extra inputs are not permitted (got 'red')"),
+    ],
+)
+def test_a_tampered_configuration_is_refused(copied, content, reason):
+    copied.config.write_text(content)
+    with pytest.raises(UserError) as caught:
+        copied.read_config()
+    assert str(caught.value).startswith(f"{copied.config}: ") and reason in str(caught.value)
+
+
+def test_a_damaged_checkpoint_is_refused(copied, no_compute):
+    path = copied.checkpoint / "arrays.npz"
+    path.write_bytes(path.read_bytes()[:-5])
+    with pytest.raises(UserError, match=r"checkpoint/arrays\.npz: damaged"):
+        train(CONFIG, copied.path, resume=True, progress=False)
+    (copied.checkpoint / "record.json").write_text('{"format": 1, "config": {}}')
+    with pytest.raises(UserError, match=r"checkpoint/record\.json: curriculum: Field required"):
+        train(CONFIG, copied.path, resume=True, progress=False)
+
+
+def test_start_from_takes_learner_and_buffer(run, tmp_path):
+    config = changed(seed=5)
+    for source in (run.snapshot("phase1"), run.path):
+        expected = state_of(source if source != run.path else run.checkpoint).train
+        with pytest.MonkeyPatch.context() as patch:
+            begun = []
+
+            def catch(_: Any, state: RunState, begun: list[RunState] = begun) -> None:
+                begun.append(state)
+
+            patch.setattr(trainer._Run, "go", catch)
+            train(config, tmp_path / source.name, start_from=source, progress=False)
+        (state,) = begun
+        assert_same_tree(state.train.learner, expected.learner)
+        assert_same_tree(state.train.buffer, expected.buffer)
+        assert_same_tree(state.best, expected.learner)
+        assert int(state.train.updates) == 0 and float(state.best_score) == -np.inf
+        fresh = training.init(config, jax.random.key(5))
+        assert_same_tree(state.train.env_states, fresh.env_states)
+        assert_same_tree(state.train.key, fresh.key)
+
+
+def test_start_from_trains(run, tmp_path):
+    # The same seed and settings, but a head start: another result.
+    agent = train(CONFIG, tmp_path / "run", start_from=run.snapshot("phase1"), progress=False)
+    assert agent is not None
+    observed = np.ones((4, 16), np.float32)
+    assert not np.allclose(agent.predict(observed), load_agent(run.path).predict(observed), atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({"network": {"hidden_sizes": (16, 8)}}, "network.hidden_sizes must be (16, 16), as in "),
+        ({"network": {"encoding": {"rate_scales": ()}}}, "network.encoding.rate_scales must be (0.003, 0.03), as in "),
+        ({"num_envs": 4}, "num_envs must be 8, as in "),
+        ({"sac": {"buffer_size": 2048}}, "sac.buffer_size must be 1024, as in "),
+    ],
+)
+def test_a_source_that_does_not_fit_is_refused(run, tmp_path, no_compute, fields, reason):
+    with pytest.raises(UserError) as caught:
+        train(changed(**fields), tmp_path / "run", start_from=run.snapshot("phase1"), progress=False)
+    assert str(caught.value).startswith(f"start_from: {reason}{run.snapshot('phase1')}")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_source_with_too_few_steps_is_refused(run, tmp_path, no_compute):
+    config = changed(sac={"n_step": 64}, prefill_steps=64)
+    with pytest.raises(UserError, match=r"sac.n_step: must be at most the 37 steps in the replay buffer of .*, got 64"):
+        train(config, tmp_path / "run", start_from=run.snapshot("phase1"), progress=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_no_source_is_refused(run, tmp_path, no_compute):
+    for source, reason in [
+        (tmp_path / "nowhere", "start_from: .*nowhere is neither a run with a checkpoint nor a snapshot"),
+        (run.agent(2), "phase2: holds an agent alone, not a training state"),
+    ]:
+        with pytest.raises(UserError, match=reason):
+            train(CONFIG, tmp_path / "run", start_from=source, progress=False)
+    with pytest.raises(UserError, match="start_from: a resumed run goes on from its own checkpoint"):
+        train(CONFIG, run.path, resume=True, start_from=run.path, progress=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_log_drops_what_was_lost_and_appends(tmp_path):
+    log = MetricsLog(tmp_path, 0)
+    for updates in (10, 20, 30):
+        log.write(updates, {"loss": updates / 3, "eval/score": None if updates == 10 else 0.5})
+    log.close()
+    path = tmp_path / "metrics.csv"
+    before = path.read_text().splitlines()
+    log = MetricsLog(tmp_path, 20)
+    assert path.read_text().splitlines() == before[:3]
+    log.write(30, {"loss": 10.0, "eval/score": 0.5})
+    log.close()
+    assert path.read_text().splitlines() == before
+    assert read_metrics(path)[0] == {"updates": "10", "loss": "3.33333333", "eval/score": ""}
+    MetricsLog(tmp_path, 5).close()
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("cut", [1, 6, 11])
+def test_a_line_cut_by_a_crash_is_dropped(tmp_path, cut):
+    path = tmp_path / "metrics.csv"
+    whole = "updates,loss\n10,0.25\n"
+    path.write_text(whole + "20,0.125\n"[:-cut] if cut < 9 else "updates,loss\n"[:-cut])
+    MetricsLog(tmp_path, 20).close()
+    assert (path.read_text() if path.exists() else "") == (whole if cut < 9 else "")
+
+
+def test_progress_speaks_only_when_enabled(capsys, monkeypatch):
+    for enabled in (True, False):
+        with Progress(CONFIG, 16, enabled=enabled) as bar:
+            bar.note("run folder: x")
+            bar.compiling()
+            bar.advance(80)
+        shown = capsys.readouterr().err
+        assert ("compiling" in shown and "phase 2" in shown and "run folder: x" in shown) == enabled
+        assert (shown == "") != enabled
+
+
+def test_a_machine_without_git_trains_too(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert trainer._commit() == ""
+
+
+def test_the_score_of_a_phase_counts_what_it_asks_for(run):
+    # Two cases with the same reward: one settles but hits the zone, one does neither.
+    from koz_jax import evaluation
+
+    cases = evaluation.MonteCarloConfig(2, 0, 80.0, 180.0)
+    results = evaluation.fly_cases(load_agent(run.path).controller, CONFIG.task, cases)
+    rewards = np.asarray(results.reward_terms.attitude)
+    results = results.replace(
+        reward_terms=jax.tree.map(np.zeros_like, results.reward_terms).replace(attitude=np.abs(rewards) + 1),
+        settled=np.array([True, False]),
+        violated=np.array([True, True]),
+    )
+    assert trainer.score(results, CONFIG, 1) == pytest.approx((abs(rewards[0]) + 1) / 2)
+    assert trainer.score(results, CONFIG, 2) == 0.0
+
+
+def test_the_run_folder_records_what_runs(run):
+    record = json.loads((run.checkpoint / "record.json").read_text())
+    assert record["updates"] == 128
+    assert TrainConfig.model_validate(record["config"]) == CONFIG
+    assert os.access(run.config, os.R_OK)
