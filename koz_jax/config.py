@@ -292,8 +292,9 @@ class RefineConfig(Settings):
     """Length of each maneuver [s]."""
     learning_rate: PositiveFloat = 1e-3
     """Learning rate at the start; it falls to zero along a cosine."""
-    max_gradient_norm: PositiveFloat = 1.0
-    """Larger gradients are scaled down to this norm."""
+    max_gradient_norm: PositiveFloat = 0.03
+    """Larger gradients are scaled down to this norm.  Nearly all are: a maneuver that hesitates in front of the zone
+    has a huge gradient, which must not outvote the others."""
     min_angle_deg: DeviationDeg = 30.0
     """Smallest initial deviation [deg]."""
     max_angle_deg: DeviationDeg = 180.0
@@ -329,7 +330,7 @@ class TrainConfig(Settings):
     """One training run."""
 
     preset: str = "custom"
-    """Settings to begin from: fast or paper; every other flag changes one of them."""
+    """Settings to begin from: fast, thorough or paper; every other flag changes one of them."""
     task: TaskConfig = TaskConfig()
     """What is learned."""
     network: NetworkConfig = NetworkConfig()

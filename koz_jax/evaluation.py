@@ -7,10 +7,12 @@ import dataclasses
 import functools
 import math
 import time
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 from jax.sharding import Mesh, PartitionSpec
 
 from koz_jax import rollout, scenario, task
@@ -19,7 +21,7 @@ from koz_jax.config import TaskConfig
 from koz_jax.env import EnvParams
 from koz_jax.errors import UserError
 from koz_jax.rollout import CaseResult, Controller
-from koz_jax.scenario import Scenario
+from koz_jax.scenario import InfeasibleRule, Scenario, ScenarioRanges
 from koz_jax.summary import Summary
 
 # Cases that a device flies together: enough to fill the vector units, few enough to stay in its cache.
@@ -82,28 +84,40 @@ def check_feasible(task_config: TaskConfig, max_angle_deg: float, name: str = "m
         )
 
 
+class _Draw(struct.PyTreeNode):
+    """What cases are drawn from; traced, so that another seed or another range does not mean a new compilation."""
+
+    key: jax.Array  # () typed PRNG key
+    ranges: ScenarioRanges
+    rule: InfeasibleRule = struct.field(pytree_node=False)
+
+    def case(self, index: jax.Array, boresight_B: jax.Array) -> Scenario:
+        """One case.  index: () int; boresight_B: (3,)."""
+        return scenario.sample(jax.random.fold_in(self.key, index), self.ranges, boresight_B, self.rule)
+
+
+def _draw(task_config: TaskConfig, config: MonteCarloConfig) -> _Draw:
+    return _Draw(
+        key=jax.random.fold_in(jax.random.key(config.seed), _PURPOSE),
+        ranges=task.scenario_ranges(task_config.scenario, config.min_angle_deg, config.max_angle_deg),
+        rule=task_config.scenario.infeasible_zone,
+    )
+
+
 def draw_case(task_config: TaskConfig, config: MonteCarloConfig, case: jax.Array) -> Scenario:
     """Draw the scenario of one case.  case: () int, its index."""
-    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), _PURPOSE), case)
-    ranges = task.scenario_ranges(task_config.scenario, config.min_angle_deg, config.max_angle_deg)
-    boresight_B = jnp.array(task_config.spacecraft.boresight)
-    return scenario.sample(key, ranges, boresight_B, task_config.scenario.infeasible_zone)
+    return _draw(task_config, config).case(case, jnp.array(task_config.spacecraft.boresight))
 
 
-@functools.partial(jax.jit, static_argnames=("task_config", "config", "mesh"))
+@functools.partial(jax.jit, static_argnames=("steps", "substeps", "mesh"))
 def _fly_cases(
-    controller: Controller,
-    params: EnvParams,
-    cases: jax.Array,
-    task_config: TaskConfig,
-    config: MonteCarloConfig,
-    mesh: Mesh,
+    controller: Controller, params: EnvParams, draw: _Draw, cases: jax.Array, *, steps: int, substeps: int, mesh: Mesh
 ) -> CaseResult:
-    """cases: (devices * chunks * chunk,) int32 indices.  Returns leaves of the same length."""
+    """cases: (devices * n,) int32 indices.  Returns leaves of the same length."""
 
     def one(case: jax.Array) -> CaseResult:
-        drawn = draw_case(task_config, config, case)
-        return rollout.run_case(controller, drawn, params, task_config.episode_steps, config.substeps)
+        drawn = draw.case(case, params.spacecraft.boresight_B)
+        return rollout.run_case(controller, drawn, params, steps, substeps)
 
     def on_one_device(cases: jax.Array) -> CaseResult:
         return jax.lax.map(one, cases, batch_size=_CHUNK)
@@ -115,13 +129,20 @@ def _fly_cases(
 
 def _arguments(
     controller: Controller, task_config: TaskConfig, config: MonteCarloConfig
-) -> tuple[tuple[Controller, EnvParams, jax.Array], dict[str, TaskConfig | MonteCarloConfig | Mesh]]:
+) -> tuple[tuple[Controller, EnvParams, _Draw, jax.Array], dict[str, Any]]:
+    """Traced and static arguments of ``_fly_cases``."""
     check_feasible(task_config, config.max_angle_deg)
     devices = jax.local_devices()[: config.cases]
     # Every device flies equally many cases; the surplus is flown and dropped.
     padded = -(-config.cases // len(devices)) * len(devices)
-    traced = (controller, task.env_params(task_config), jnp.arange(padded, dtype=jnp.int32))
-    return traced, {"task_config": task_config, "config": config, "mesh": Mesh(np.array(devices), ("cases",))}
+    traced = (
+        controller,
+        task.env_params(task_config),
+        _draw(task_config, config),
+        jnp.arange(padded, dtype=jnp.int32),
+    )
+    mesh = Mesh(np.array(devices), ("cases",))
+    return traced, {"steps": task_config.episode_steps, "substeps": config.substeps, "mesh": mesh}
 
 
 def _to_host(results: CaseResult, cases: int) -> CaseResult:

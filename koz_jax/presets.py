@@ -93,7 +93,21 @@ def _fast() -> TrainConfig:
     )
 
 
-PRESETS = {"fast": _fast(), "paper": _paper()}
+def _thorough() -> TrainConfig:
+    """The fast preset with more of everything; the shipped agents come from it."""
+    fast = _fast()
+    longer = fast.curriculum.phase2.model_copy(update={"updates": 360_000})
+    return fast.model_copy(
+        update={
+            "preset": "thorough",
+            "curriculum": fast.curriculum.model_copy(update={"phase2": longer}),
+            "refine": fast.refine.model_copy(update={"iterations": 3000, "scenarios": 256}),
+            "eval_cases": 4000,
+        }
+    )
+
+
+PRESETS = {"fast": _fast(), "thorough": _thorough(), "paper": _paper()}
 
 
 def preset(name: str) -> TrainConfig:

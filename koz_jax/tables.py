@@ -58,10 +58,15 @@ def history_csv(history: History, task: TaskConfig) -> str:
 
 def describe_case(case: int, result: CaseResult) -> str:
     """One case in one line."""
+    return f"case {case}: {describe_result(result)}"
+
+
+def describe_result(result: CaseResult) -> str:
+    """What a maneuver comes to, in one line."""
     settled = f"settled after {float(result.settling_time):.1f} s" if result.settled else "not settled"
     zone = "violated the zone" if result.violated else "stayed clear of the zone"
     return (
-        f"case {case}: {np.rad2deg(float(result.initial_angle)):.1f} deg, {settled}, {zone}"
+        f"{np.rad2deg(float(result.initial_angle)):.1f} deg, {settled}, {zone}"
         f" (smallest margin {np.rad2deg(float(result.min_margin)):.2f} deg),"
         f" effort {float(result.control_effort):.1f} N2 m2 s,"
         f" accuracy {np.rad2deg(float(result.control_accuracy)):.4f} deg, reward {float(result.reward):.1f}"

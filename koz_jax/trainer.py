@@ -142,7 +142,7 @@ class _Run:
             while state.done < self.config.length and not self.stop.requested:
                 learning = state.done < self.config.curriculum.updates
                 state, measured = self._learn(state) if learning else self._refine(state)
-                values = measured | blank
+                values = measured | blank | measured  # what is measured stands first, and is not blanked
                 blank = {}
                 self.bar.advance(state.done)
                 if state.done in self.evaluations:

@@ -40,6 +40,7 @@ def test_paper_loop():
     assert PAPER.training_episode_seconds == 100.0
     assert PAPER.training_episode_steps == 1000
     assert PAPER.buffer_steps == 10**6
+    assert PAPER.refine.iterations == 0  # the paper knows no such stage
     assert (PAPER.eval_min_angle_deg, PAPER.eval_max_angle_deg) == (80.0, 180.0)
 
 

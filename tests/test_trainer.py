@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import os
 import shutil
 import signal
@@ -12,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.core
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny
@@ -24,6 +27,8 @@ from koz_jax.errors import UserError
 from koz_jax.interrupt import StopRequest
 from koz_jax.metrics_log import MetricsLog, read_metrics
 from koz_jax.progress import Progress
+from koz_jax.reward import PAPER_WEIGHTS
+from koz_jax.rollout import CaseResult
 from koz_jax.run_folder import RunFolder, RunState
 from koz_jax.trainer import train
 
@@ -46,20 +51,26 @@ def copied(run, tmp_path) -> RunFolder:
 
 @pytest.fixture
 def no_compute(monkeypatch) -> None:
-    """Make an error of whatever would cost time."""
-    for name in ("init", "train_chunk"):
-        monkeypatch.setattr(training, name, lambda *_: pytest.fail("something was computed"))
+    """Make an error of whatever would be compiled."""
+    init = training.init
+
+    def only_shapes(config: TrainConfig, key: jax.Array) -> training.TrainState:
+        return init(config, key) if isinstance(key, jax.core.Tracer) else pytest.fail("networks were made")
+
+    monkeypatch.setattr(training, "init", only_shapes)
+    monkeypatch.setattr(training, "train_chunk", lambda *_: pytest.fail("something was learned"))
+    monkeypatch.setattr(trainer.refine, "refine_chunk", lambda *_: pytest.fail("something was refined"))
     monkeypatch.setattr(trainer.evaluation, "fly_cases", lambda *_: pytest.fail("something was flown"))
 
 
 @contextlib.contextmanager
-def signal_after(updates: int, number: signal.Signals) -> Iterator[None]:
-    """Send this process a signal when a run has done so many updates."""
+def signal_after(done: int, number: signal.Signals) -> Iterator[None]:
+    """Send this process a signal when a run has done so much."""
     advance = Progress.advance
 
     def advance_and_signal(bar: Progress, at: int) -> None:
         advance(bar, at)
-        if at == updates:
+        if at == done:
             signal.raise_signal(number)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -68,11 +79,8 @@ def signal_after(updates: int, number: signal.Signals) -> Iterator[None]:
 
 
 def changed(**fields: Any) -> TrainConfig:
-    """The tiny configuration with other values in some fields (sections are replaced field by field)."""
-    content = CONFIG.model_dump()
-    for name, value in fields.items():
-        content[name] = content[name] | value if isinstance(value, dict) else value
-    return TrainConfig.model_validate(content)
+    """The tiny configuration with other values in some fields."""
+    return TrainConfig.model_validate(tiny.merged(CONFIG.model_dump(), fields))
 
 
 def state_of(folder: Path) -> RunState:
@@ -106,16 +114,12 @@ def assert_same_run(found: RunFolder, expected: RunFolder) -> None:
         assert one.provenance.updates == other.provenance.updates
 
 
-def contents(folder: Path) -> dict[Path, bytes | None]:
-    """Everything in a folder."""
-    return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
-
-
 def test_layout_of_a_run(run):
     found = {str(path.relative_to(run.path)) for path in run.path.rglob("*") if "tensorboard/" not in str(path)}
     saved = [
         ("agents/phase1", "agents"),
         ("agents/phase2", "agents"),
+        ("agents/phase2-sac", "agents"),
         ("snapshots/phase1", "snapshots"),
         ("checkpoint", "checkpoint"),
     ]
@@ -132,16 +136,19 @@ def test_layout_of_a_run(run):
 
 def test_metrics_have_a_row_per_chunk_and_an_evaluation_where_due(run):
     rows = read_metrics(run.path / "metrics.csv")
-    assert [int(row["updates"]) for row in rows] == [16, 32, 48, 64, 80, 96, 112, 128]
-    assert [row["eval/success_rate"] != "" for row in rows] == [False, True] * 4
-    assert [int(row["env_steps"]) for row in rows] == [8 * (5 + updates // 2) for updates in range(16, 129, 16)]
-    assert all(np.isfinite(float(row[name])) for row in rows for name in row if name.startswith(("train/", "reward/")))
+    learned, refined = rows[:8], rows[8:]
+    assert [int(row["updates"]) for row in learned] == [16, 32, 48, 64, 80, 96, 112, 128]
+    assert [int(row["updates"]) for row in refined] == [130, 132, 134, 136]
+    assert [row["eval/success_rate"] != "" for row in rows] == [False, True] * 6
+    assert [int(row["env_steps"]) for row in learned] == [8 * (5 + updates // 2) for updates in range(16, 129, 16)]
+    for row in learned:
+        assert all(np.isfinite(float(row[name])) for name in row if name.startswith(("train/", "reward/")))
+        assert row["refine/cost"] == ""
+    assert all(float(row["refine/cost"]) > 0 and row["train/critic_loss"] == "" for row in refined)
     assert {"train/critic_loss", "reward/zone", "curriculum/max_angle", "updates_per_second"} <= rows[0].keys()
 
 
 def test_metrics_go_to_tensorboard_too(run):
-    loader = pytest.importorskip("tensorboardX.record_writer", reason="reads the file it wrote")
-    del loader
     (events,) = (run.path / "tensorboard").iterdir()
     content = events.read_bytes()
     for name in (b"train/critic_loss", b"eval/success_rate", b"curriculum/zone_weight"):
@@ -154,18 +161,27 @@ def test_agents_tell_where_they_come_from(run):
         provenance = agent.provenance
         assert (provenance.phase, provenance.seed) == (phase, CONFIG.seed)
         assert provenance.updates in ({32, 64}, {96, 128})[phase - 1]
+        assert provenance.refinements in ({0}, {0, 4, 8})[phase - 1]
         assert provenance.command.startswith("python ") and provenance.version
         assert agent.task == CONFIG.task
 
 
-@pytest.mark.parametrize(("updates", "number"), [(48, signal.SIGINT), (64, signal.SIGTERM), (112, signal.SIGINT)])
-def test_a_stopped_and_resumed_run_equals_the_undisturbed_one(run, tmp_path, updates, number):
-    # 48 and 112 are between evaluations, where only the stop itself makes the checkpoint; 64 is the end of phase 1.
+# 48, 112 and 134 are between evaluations, where only the stop itself makes the checkpoint; the others end a stage.
+@pytest.mark.parametrize(
+    ("done", "number"),
+    [
+        (48, signal.SIGINT),
+        (64, signal.SIGTERM),
+        (112, signal.SIGTERM),
+        (tiny.LEARNED, signal.SIGINT),
+        (134, signal.SIGINT),
+    ],
+)
+def test_a_stopped_and_resumed_run_equals_the_undisturbed_one(run, tmp_path, done, number):
     folder = RunFolder(tmp_path / "run")
-    with signal_after(updates, number):
+    with signal_after(done, number):
         assert train(CONFIG, folder.path, progress=False) is None
-    assert int(state_of(folder.checkpoint).train.updates) == updates
-    assert signal.getsignal(number) is not signal.SIG_DFL  # Python's own handling is back
+    assert state_of(folder.checkpoint).done == done
     agent = train(CONFIG, folder.path, resume=True, progress=False)
     assert agent is not None
     assert_same_run(folder, run)
@@ -193,12 +209,12 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(run, tmp_path, monkeypatc
         saves = trainer.save_state
 
         def save(path: Path, state: RunState, config: TrainConfig) -> None:
-            crash() if int(state.train.updates) > 64 else saves(path, state, config)
+            crash() if state.done > 64 else saves(path, state, config)
 
         patch.setattr(trainer, "save_state", save)
         with pytest.raises(RuntimeError, match="power cut"):
             train(CONFIG, folder.path, progress=False)
-    assert int(state_of(folder.checkpoint).train.updates) == 64
+    assert state_of(folder.checkpoint).done == 64
     assert [row["updates"] for row in read_metrics(folder.path / "metrics.csv")][-1] == "96"
     assert train(CONFIG, folder.path, resume=True, progress=False) is not None
     assert_same_run(folder, run)
@@ -215,7 +231,7 @@ def test_a_signal_before_the_first_update_makes_a_checkpoint_too(run, tmp_path, 
     with monkeypatch.context() as patch:
         patch.setattr(trainer, "_begin", signalled)
         assert train(CONFIG, folder.path, progress=False) is None
-    assert int(state_of(folder.checkpoint).train.updates) == 0
+    assert state_of(folder.checkpoint).done == 0
     assert train(CONFIG, folder.path, resume=True, progress=False) is not None
     assert_same_run(folder, run)
 
@@ -253,7 +269,7 @@ def test_the_best_learner_of_phase_1_starts_phase_2(tmp_path, monkeypatch):
     with signal_after(64, signal.SIGINT):
         assert train(CONFIG, folder.path, progress=False) is None
     snapshot, begun = state_of(folder.snapshot("phase1")), state_of(folder.checkpoint)
-    assert (float(snapshot.best_score), int(snapshot.best_updates)) == (2.0, 32)
+    assert (float(snapshot.best_score), int(snapshot.best_at)) == (2.0, 32)
     assert_same_tree(begun.train.learner, snapshot.best)
     assert not np.array_equal(begun.train.learner.log_alpha, snapshot.train.learner.log_alpha)
     assert_same_tree(begun.train.buffer, snapshot.train.buffer)
@@ -263,10 +279,31 @@ def test_the_best_learner_of_phase_1_starts_phase_2(tmp_path, monkeypatch):
     assert_same_tree(agent.controller.policy, snapshot.best.averaged_policy)
 
 
+def test_refinement_begins_with_the_best_of_phase_2_and_the_best_of_all_is_returned(tmp_path, monkeypatch):
+    scores = iter([1.0, 1.0, 4.0, 3.0, 5.0, 2.0])
+    monkeypatch.setattr(trainer, "score", lambda *_: next(scores))
+    folder = RunFolder(tmp_path / "run")
+    with signal_after(tiny.LEARNED, signal.SIGINT):
+        assert train(CONFIG, folder.path, progress=False) is None
+    begun = state_of(folder.checkpoint)
+    assert int(begun.best_at) == 96
+    assert_same_tree(begun.refine.policy, begun.best.averaged_policy)
+    assert_same_tree(begun.refine.policy, load_agent(folder.sac_agent).controller.policy)
+    agent = train(CONFIG, folder.path, resume=True, progress=False)
+    assert agent is not None
+    assert (agent.provenance.updates, agent.provenance.refinements) == (128, 4)
+    assert load_agent(folder.path).provenance == agent.provenance
+    assert_same_tree(agent.controller, load_agent(folder.path).controller)
+
+
 def test_a_training_of_one_phase_returns_its_best(tmp_path, monkeypatch):
     scores = iter([2.0, 1.0])
     monkeypatch.setattr(trainer, "score", lambda *_: next(scores))
-    config = changed(curriculum={"phase2": CONFIG.curriculum.phase2.model_dump() | {"updates": 0}})
+    config = changed(curriculum={"phase2": {"updates": 0}}, refine={"iterations": 0})
+    # Phase 1 is the same with or without a second phase: use what is compiled already.
+    init, train_chunk = training.init, training.train_chunk
+    monkeypatch.setattr(training, "init", lambda _, key: init(CONFIG, key))
+    monkeypatch.setattr(training, "train_chunk", lambda _, state, steps: train_chunk(CONFIG, state, steps))
     folder = RunFolder(tmp_path / "run")
     agent = train(config, folder.path, progress=False)
     assert agent is not None
@@ -277,27 +314,31 @@ def test_a_training_of_one_phase_returns_its_best(tmp_path, monkeypatch):
 
 
 def test_resuming_a_finished_run_returns_its_agent_without_training(run, copied, no_compute):
-    before = contents(copied.path)
+    before = tiny.contents(copied.path)
     agent = train(CONFIG, copied.path, resume=True, progress=False)
     assert agent is not None
     saved = load_agent(run.path)
     assert_same_tree(agent.controller, saved.controller)
     assert agent.provenance.updates == saved.provenance.updates
-    assert contents(copied.path) == before
+    assert tiny.contents(copied.path) == before
 
 
 def test_a_used_folder_is_refused_and_stays_as_it_is(copied, tmp_path, no_compute):
-    before = contents(copied.path)
+    before = tiny.contents(copied.path)
     for resumed in (copied.path, copied.path / "agents", copied.config):
         with pytest.raises(UserError, match="exists already"):
             train(CONFIG, resumed, progress=False)
-    assert contents(copied.path) == before
+    assert tiny.contents(copied.path) == before
 
 
 def test_an_empty_folder_is_used(tmp_path, monkeypatch):
-    monkeypatch.setattr(trainer, "_begin", lambda *_: pytest.skip("the folder was accepted"))
-    train(CONFIG, tmp_path, progress=False)
-    pytest.fail("the folder was not accepted")
+    def accepted(*_: Any) -> None:
+        raise InterruptedError
+
+    monkeypatch.setattr(trainer, "_begin", accepted)
+    with pytest.raises(InterruptedError):
+        train(CONFIG, tmp_path, progress=False)
+    assert RunFolder(tmp_path).read_config() == CONFIG
 
 
 @pytest.mark.parametrize("parent", ["file", "x" * 300])
@@ -323,13 +364,13 @@ def test_what_is_no_run_is_not_resumed(tmp_path, no_compute):
 
 
 def test_a_run_keeps_its_settings(copied, no_compute):
-    before = contents(copied.path)
+    before = tiny.contents(copied.path)
     other = changed(sac={"reward_scale": 0.5})
     with pytest.raises(UserError, match=r"resume: sac.reward_scale is 0.5, but .*copy was begun with 1.0; a run keeps"):
         train(other, copied.path, resume=True, progress=False)
     with pytest.raises(UserError, match=r"resume: network.hidden_sizes is \(16, 8\), but"):
         train(changed(network={"hidden_sizes": (16, 8)}), copied.path, resume=True, progress=False)
-    assert contents(copied.path) == before
+    assert tiny.contents(copied.path) == before
 
 
 @pytest.mark.parametrize(
@@ -360,7 +401,6 @@ def test_a_damaged_checkpoint_is_refused(copied, no_compute):
 
 
 def test_start_from_takes_learner_and_buffer(run, tmp_path):
-    config = changed(seed=5)
     for source in (run.snapshot("phase1"), run.path):
         expected = state_of(source if source != run.path else run.checkpoint).train
         with pytest.MonkeyPatch.context() as patch:
@@ -370,13 +410,13 @@ def test_start_from_takes_learner_and_buffer(run, tmp_path):
                 begun.append(state)
 
             patch.setattr(trainer._Run, "go", catch)
-            train(config, tmp_path / source.name, start_from=source, progress=False)
+            train(CONFIG, tmp_path / source.name, start_from=source, progress=False)
         (state,) = begun
         assert_same_tree(state.train.learner, expected.learner)
         assert_same_tree(state.train.buffer, expected.buffer)
         assert_same_tree(state.best, expected.learner)
-        assert int(state.train.updates) == 0 and float(state.best_score) == -np.inf
-        fresh = training.init(config, jax.random.key(5))
+        assert state.done == 0 and float(state.best_score) == -np.inf
+        fresh = training.init(CONFIG, jax.random.key(CONFIG.seed))
         assert_same_tree(state.train.env_states, fresh.env_states)
         assert_same_tree(state.train.key, fresh.key)
 
@@ -427,15 +467,18 @@ def test_what_is_no_source_is_refused(run, tmp_path, no_compute):
 def test_the_log_drops_what_was_lost_and_appends(tmp_path):
     log = MetricsLog(tmp_path, 0)
     for updates in (10, 20, 30):
-        log.write(updates, {"loss": updates / 3, "eval/score": None if updates == 10 else 0.5})
+        log.write(updates, {"loss": updates / 3, "eval/score": math.nan if updates == 10 else 0.5})
     log.close()
     path = tmp_path / "metrics.csv"
     before = path.read_text().splitlines()
     log = MetricsLog(tmp_path, 20)
     assert path.read_text().splitlines() == before[:3]
-    log.write(30, {"loss": 10.0, "eval/score": 0.5})
+    with pytest.raises(KeyError, match="colour"):
+        log.write(30, {"colour": 1.0})
+    log.write(30, {"eval/score": 0.5, "loss": 10.0})
+    log.write(40, {"eval/score": 0.5})
     log.close()
-    assert path.read_text().splitlines() == before
+    assert path.read_text().splitlines() == [*before, "40,,0.5"]
     assert read_metrics(path)[0] == {"updates": "10", "loss": "3.33333333", "eval/score": ""}
     MetricsLog(tmp_path, 5).close()
     assert not path.exists()
@@ -466,24 +509,28 @@ def test_a_machine_without_git_trains_too(monkeypatch, tmp_path):
     assert trainer._commit() == ""
 
 
-def test_the_score_of_a_phase_counts_what_it_asks_for(run):
-    # Two cases with the same reward: one settles but hits the zone, one does neither.
-    from koz_jax import evaluation
-
-    cases = evaluation.MonteCarloConfig(2, 0, 80.0, 180.0)
-    results = evaluation.fly_cases(load_agent(run.path).controller, CONFIG.task, cases)
-    rewards = np.asarray(results.reward_terms.attitude)
-    results = results.replace(
-        reward_terms=jax.tree.map(np.zeros_like, results.reward_terms).replace(attitude=np.abs(rewards) + 1),
-        settled=np.array([True, False]),
-        violated=np.array([True, True]),
+def test_the_score_of_a_phase_counts_what_it_asks_for():
+    # One case succeeds, one settles but violates the zone, one does not settle.
+    terms = jax.tree.map(lambda _: jnp.zeros(3), PAPER_WEIGHTS).replace(
+        attitude=jnp.array([100.0, 10.0, 1.0]), zone=jnp.array([-4.0, -4.0, -4.0])
     )
-    assert trainer.score(results, CONFIG, 1) == pytest.approx((abs(rewards[0]) + 1) / 2)
-    assert trainer.score(results, CONFIG, 2) == 0.0
+    results = CaseResult(
+        initial_angle=jnp.ones(3),
+        reward_terms=terms,
+        settling_time=jnp.array([1.0, 1.0, jnp.nan]),
+        control_effort=jnp.ones(3),
+        control_accuracy=jnp.ones(3),
+        min_margin=jnp.array([1.0, -1.0, 1.0]),
+        settled=jnp.array([True, True, False]),
+        violated=jnp.array([False, True, False]),
+    )
+    # Phase 1 ends with zone weight 0, phase 2 with 1.
+    assert trainer.score(results, CONFIG, 1) == pytest.approx((100 + 10) / 3)
+    assert trainer.score(results, CONFIG, 2) == pytest.approx((100 - 4) / 3)
 
 
 def test_the_run_folder_records_what_runs(run):
     record = json.loads((run.checkpoint / "record.json").read_text())
-    assert record["updates"] == 128
+    assert record["done"] == 136
     assert TrainConfig.model_validate(record["config"]) == CONFIG
     assert os.access(run.config, os.R_OK)

@@ -282,7 +282,7 @@ def test_first_episodes_are_spread_over_time(steps):
     """Or all environments would be in the same part of their episode for ever."""
     ends = np.stack([step.ended for step in steps])
     np.testing.assert_array_equal(ends.sum(axis=0), STEPS // EPISODE)
-    assert np.all(ends.sum(axis=1) > 0)
+    assert np.max(ends.mean(axis=1)) <= 0.5
 
 
 def test_torque_change_is_zero_in_the_first_step_of_every_episode(steps):
@@ -322,7 +322,7 @@ def test_prefill_acts_uniformly_and_training_acts_by_its_policy(steps, flight):
 def test_no_key_is_used_twice():
     """By jax's own checker, which looks at the traced program."""
     params = task.env_params(CONFIG.task)
-    init = functools.partial(training.init.__wrapped__, CONFIG)
+    init = functools.partial(training.init, CONFIG)
     state = jax.eval_shape(init, KEY)
     with jax.debug_key_reuse(True):
         jax.jit(init).trace(KEY)
@@ -421,7 +421,8 @@ def test_a_loaded_buffer_is_not_joined_to_new_episodes(steps):
     """Else a window would run from the last step of the old run into the first one of the new."""
     source = jax.tree.map(jnp.array, steps[0].after)
     source = source.replace(key=jax.random.wrap_key_data(source.key))
-    begun = to_host(trainer._begin(CONFIG, trainer._fresh(source)).train)
+    source = trainer._begin(CONFIG, None).replace(train=source)
+    begun = to_host(trainer._begin(CONFIG, source).train)
     newest = jax.tree.map(lambda leaf: leaf[begun.buffer.head - 1], begun.buffer.rows)
     observed = jax.jit(jax.vmap(observation.observe, in_axes=(0, None)))(begun.env_states, task.env_params(CONFIG.task))
     goes_on = np.all(np.isclose(newest.next_observation, observed, atol=1e-5), axis=-1)

@@ -1,48 +1,66 @@
 """A training run of seconds, and the two command lines as modules; shared by the tests of the user's side."""
 
+import contextlib
 import functools
 import importlib.util
 import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
+from jax.experimental.compilation_cache import compilation_cache
 
 from koz_jax import observation
 from koz_jax.agent import Agent, PolicyController, Provenance, policy_network
 from koz_jax.config import TrainConfig
+from koz_jax.presets import preset
 from koz_jax.run_folder import RunFolder
 from koz_jax.trainer import train
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# One phase each of 64 updates, with two logged chunks and two evaluations each.
+# Two phases of 64 updates, each with an evaluation every second row of the log; then 8 iterations of refinement.
 SETTINGS: dict[str, Any] = {
     "task": {"episode_seconds": 2.0},
-    "network": {"hidden_sizes": (16, 16)},
+    "network": {"hidden_sizes": (16, 16), "encoding": {"rate_scales": (0.003, 0.03)}},
     "sac": {"batch_size": 16, "buffer_size": 1024, "n_step": 3},
     "curriculum": {
-        "phase1": {"updates": 64, "max_angle_deg": ((0.0, 10.0), (0.75, 180.0))},
-        "phase2": {"updates": 64, "zone_weight": ((0.0, 1.0),)},
+        "phase1": {"updates": 64},
+        "phase2": {"updates": 64},
     },
+    "refine": {"iterations": 8, "scenarios": 4, "horizon_seconds": 1.0},
     "num_envs": 8,
     "updates_per_step": 2,
     "prefill_steps": 5,
     "training_episode_seconds": 1.0,
     "eval_every": 32,
     "log_every": 16,
-    "eval_cases": 8,
+    "refine_log_every": 2,
+    "refine_eval_every": 4,
+    "eval_cases": 12,
 }
-CONFIG = TrainConfig.model_validate(SETTINGS)
+LEARNED = 128  # updates
+CASES = 12  # as many as in an evaluation: what is compiled for one serves the other
 
 
-def flags(settings: dict[str, Any] = SETTINGS, prefix: str = "--") -> list[str]:
-    """The settings as arguments of ``train.py``."""
+def merged(settings: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """Settings with some changed, section by section."""
+    inner = {name: merged(settings[name], value) for name, value in changes.items() if isinstance(value, dict)}
+    return settings | changes | inner
+
+
+CONFIG = TrainConfig.model_validate(merged(preset("paper").model_dump(), SETTINGS))
+
+
+def flags(settings: dict[str, Any], prefix: str = "--") -> list[str]:
+    """Settings as arguments of ``train.py``."""
     found = []
     for name, value in settings.items():
         flag = prefix + name.replace("_", "-")
@@ -58,6 +76,8 @@ def _row(value: Any) -> tuple[Any, ...]:
     return value if isinstance(value, tuple) else (value,)
 
 
+FLAGS = ["--preset", "paper", *flags(SETTINGS)]
+
 _FOLDER = tempfile.TemporaryDirectory(prefix="koz_jax-tests-")
 
 
@@ -65,8 +85,28 @@ _FOLDER = tempfile.TemporaryDirectory(prefix="koz_jax-tests-")
 def finished_run() -> RunFolder:
     """The undisturbed run of ``CONFIG``, trained once per session.  Read it, do not change it."""
     folder = RunFolder(Path(_FOLDER.name) / "undisturbed")
-    assert train(CONFIG, folder.path, progress=False) is not None
+    with kept_programs():
+        assert train(CONFIG, folder.path, progress=False) is not None
     return folder
+
+
+# Programs that this session compiled, for its subprocesses.
+CACHE = Path(_FOLDER.name) / "compiled"
+
+
+@contextlib.contextmanager
+def kept_programs() -> Iterator[None]:
+    """Keep what is compiled in ``CACHE``."""
+    values = {"jax_compilation_cache_dir": str(CACHE), "jax_persistent_cache_min_compile_time_secs": 0.0}
+    before = {name: getattr(jax.config, name) for name in values}
+    for name, value in values.items():
+        jax.config.update(name, value)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)
+        compilation_cache.reset_cache()
 
 
 @functools.cache
@@ -81,29 +121,31 @@ def script(name: str) -> ModuleType:
 
 
 def status(name: str, *argv: object) -> int:
-    """Run a command line in this process.  Returns its exit status."""
+    """Run a command line in this process, on the devices that it has.  Returns the exit status."""
     try:
-        return script(name).main([str(arg) for arg in argv])
+        with mock.patch("koz_jax.runtime.configure"):
+            return script(name).main([str(arg) for arg in argv])
     except SystemExit as end:
         assert isinstance(end.code, int)
         return end.code
 
 
-def environment(cache: Path) -> dict[str, str]:
-    """Environment of a subprocess that keeps its compiled programs to the tests."""
-    return {
+def run_python(*argv: object, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    """Run Python in a subprocess, which shares the compiled programs of this session."""
+    environment = {
         **os.environ,
-        "JAX_COMPILATION_CACHE_DIR": str(cache),
+        "JAX_COMPILATION_CACHE_DIR": str(CACHE),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "JAX_PLATFORMS": "cpu",
-        "COLUMNS": "100",
+        "PYTHONPATH": str(ROOT),
     }
-
-
-def run_python(*argv: object, cache: Path, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
-    """Run Python in a subprocess."""
     command = [sys.executable, *map(str, argv)]
-    return subprocess.run(command, env=environment(cache), cwd=cwd, capture_output=True, text=True, check=False)
+    return subprocess.run(command, env=environment, cwd=cwd, capture_output=True, text=True, check=False)
+
+
+def contents(folder: Path) -> dict[Path, bytes | None]:
+    """Everything in a folder."""
+    return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
 
 
 def untrained_agent(seed: int = 0) -> Agent:
