@@ -97,10 +97,11 @@ def _act(controller: PolicyController, observed: jax.Array) -> jax.Array:
 
 def shipped_agents() -> tuple[str, ...]:
     """Names of the agents inside the package."""
-    return tuple(sorted(record.parent.name for record in _shipped_folder().glob("[!.]*/record.json")))
+    return tuple(sorted(record.parent.name for record in shipped_folder().glob("[!.]*/record.json")))
 
 
-def _shipped_folder() -> Path:
+def shipped_folder() -> Path:
+    """Where the agents inside the package are."""
     return Path(str(importlib.resources.files("koz_jax"))) / "agents"
 
 
@@ -112,7 +113,7 @@ def find_agent(name: str | Path) -> Path:
 
     """
     if str(name) in shipped_agents():
-        return _shipped_folder() / str(name)
+        return shipped_folder() / str(name)
     folder = Path(name)
     # The latest phase's agent is the run's result.
     for candidate in (folder, folder / "agents" / "phase2", folder / "agents" / "phase1"):

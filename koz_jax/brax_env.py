@@ -57,7 +57,7 @@ class ReorientationEnv(Env):
         after, outcome = env.step(before, action, self._params)
         terms = reward.terms(outcome, self._params.reward, self._params.spacecraft.torque_limit)
         cut = (after.steps >= self._task.episode_steps).astype(jnp.float32)
-        return state.replace(
+        return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
             pipeline_state=after,
             obs=observation.observe(after, self._params),
             reward=reward.total(terms, reward.PAPER_WEIGHTS),

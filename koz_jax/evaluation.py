@@ -91,7 +91,7 @@ class _Draw(struct.PyTreeNode):
     ranges: ScenarioRanges
     rule: InfeasibleRule = struct.field(pytree_node=False)
 
-    def case(self, index: jax.Array, boresight_B: jax.Array) -> Scenario:
+    def case(self, index: jax.Array | int, boresight_B: jax.Array) -> Scenario:
         """One case.  index: () int; boresight_B: (3,)."""
         return scenario.sample(jax.random.fold_in(self.key, index), self.ranges, boresight_B, self.rule)
 
@@ -104,7 +104,7 @@ def _draw(task_config: TaskConfig, config: MonteCarloConfig) -> _Draw:
     )
 
 
-def draw_case(task_config: TaskConfig, config: MonteCarloConfig, case: jax.Array) -> Scenario:
+def draw_case(task_config: TaskConfig, config: MonteCarloConfig, case: jax.Array | int) -> Scenario:
     """Draw the scenario of one case.  case: () int, its index."""
     return _draw(task_config, config).case(case, jnp.array(task_config.spacecraft.boresight))
 

@@ -76,6 +76,7 @@ def _fast() -> TrainConfig:
             ),
             phase2=PhaseConfig(
                 updates=120_000,
+                min_angle_deg=constant(20.0),
                 zone_weight=((0.0, 0.5), (0.1, 2.0)),
                 zone_tightening_deg=constant(1.25),
                 zone_steepness=constant(2.0),

@@ -76,7 +76,8 @@ def maneuver_cost(controller: PolicyController, key: jax.Array, config: TrainCon
     params = task.env_params(config.task)
     ranges = task.scenario_ranges(config.task.scenario, config.refine.min_angle_deg, config.refine.max_angle_deg)
     boresight_B = params.spacecraft.boresight_B
-    drawn = scenario.sample(key, ranges, boresight_B, config.task.scenario.infeasible_zone, MAX_DRAWS)
+    rule = config.task.scenario.infeasible_zone
+    drawn = scenario.sample(key, ranges, boresight_B, rule, MAX_DRAWS, keep_angle=True)
 
     def advance(state: EnvState, _: None) -> tuple[EnvState, jax.Array]:
         action = controller.act(observation.observe(state, params))

@@ -38,6 +38,7 @@ class Scenario(struct.PyTreeNode):
 
 
 class _Draw(struct.PyTreeNode):
+    angle: jax.Array  # () [rad] deviation
     q_e: jax.Array  # (4,) attitude relative to the target
     omega_BN_B: jax.Array  # (3,) [rad/s]
     zone_axis_D: jax.Array  # (3,) zone axis in target axes
@@ -45,13 +46,16 @@ class _Draw(struct.PyTreeNode):
     size: jax.Array  # () in [0, 1], where the half angle lies in its range
 
 
-def _draw(key: jax.Array, ranges: ScenarioRanges, boresight_B: jax.Array) -> _Draw:
+def _draw(key: jax.Array, ranges: ScenarioRanges, boresight_B: jax.Array, angle: jax.Array | None = None) -> _Draw:
+    """Draw once, with a new deviation or with the one given."""
     key_axis, key_angle, key_rate, key_size = jax.random.split(key, 4)
     axis = rotations.normalize(jax.random.normal(key_axis, (3,)))
-    share = jax.random.uniform(key_angle) ** ranges.angle_bias
-    angle = ranges.min_angle + (ranges.max_angle - ranges.min_angle) * share
+    if angle is None:
+        share = jax.random.uniform(key_angle) ** ranges.angle_bias
+        angle = ranges.min_angle + (ranges.max_angle - ranges.min_angle) * share
     zone_axis_D = rotations.rotate(rotations.from_axis_angle(axis, 0.5 * angle), boresight_B)
     return _Draw(
+        angle=angle,
         q_e=rotations.from_axis_angle(axis, angle),
         omega_BN_B=ranges.max_rate * jax.random.uniform(key_rate, (3,), minval=-1.0, maxval=1.0),
         zone_axis_D=zone_axis_D,
@@ -82,6 +86,7 @@ def sample(
     boresight_B: jax.Array,
     rule: InfeasibleRule = "resample",
     max_draws: int = 1000,
+    keep_angle: bool = False,
 ) -> Scenario:
     """Draw one scenario with target attitude identity.
 
@@ -92,6 +97,8 @@ def sample(
         rule: what to do where the zone would hold start or target: ``resample`` draws the whole case again,
             ``shrink`` makes the zone smaller, or leaves it out where even the smallest does not fit.
         max_draws: ``resample`` gives up after so many draws, and shrinks the zone of the last one.
+        keep_angle: ``resample`` draws all but the deviation again.  Deviations are then distributed as ``ranges`` says,
+            while drawing them again favours large ones, which leave more room for a zone.
     """
     first = _draw(jax.random.fold_in(key, 0), ranges, boresight_B)
     if rule == "shrink":
@@ -103,8 +110,9 @@ def sample(
             return (draws < max_draws) & ~_is_feasible(draw, ranges)
 
         def again(carry: tuple[jax.Array, _Draw]) -> tuple[jax.Array, _Draw]:
-            draws, _ = carry
-            return draws + 1, _draw(jax.random.fold_in(key, draws), ranges, boresight_B)
+            draws, draw = carry
+            key_next = jax.random.fold_in(key, draws)
+            return draws + 1, _draw(key_next, ranges, boresight_B, draw.angle if keep_angle else None)
 
         _, draw = jax.lax.while_loop(infeasible, again, (jnp.int32(1), first))
         half_angle = jnp.where(

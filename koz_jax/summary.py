@@ -4,6 +4,7 @@ import dataclasses
 import math
 
 import numpy as np
+import numpy.typing as npt
 
 from koz_jax.rollout import CaseResult
 
@@ -47,7 +48,7 @@ def summarise(results: CaseResult) -> Summary:
     """Means, standard deviations and rates.  results: NumPy leaves (cases,)."""
     settled = np.asarray(results.settled)
 
-    def over_settled(values: np.ndarray) -> tuple[float, float]:
+    def over_settled(values: npt.ArrayLike) -> tuple[float, float]:
         chosen = np.asarray(values, np.float64)[settled]
         return (float(chosen.mean()), float(chosen.std())) if chosen.size else (math.nan, math.nan)
 

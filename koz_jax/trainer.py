@@ -22,6 +22,7 @@ from koz_jax.metrics_log import MetricsLog, flatten
 from koz_jax.progress import Progress
 from koz_jax.rollout import CaseResult
 from koz_jax.run_folder import RunFolder, RunState, load_checkpoint, load_source, save_state
+from koz_jax.sac import replay
 from koz_jax.summary import Summary, summarise
 from koz_jax.training import TrainState
 
@@ -89,7 +90,7 @@ def _begin(config: TrainConfig, source: RunState | None) -> RunState:
     """Make a fresh state, or one that takes learner and replay buffer from another run."""
     state = training.init(config, jax.random.key(config.seed))
     if source is not None:
-        state = state.replace(learner=source.train.learner, buffer=source.train.buffer)
+        state = state.replace(learner=source.train.learner, buffer=replay.seal(source.train.buffer))
     return _fresh(config, state)
 
 

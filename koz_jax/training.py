@@ -71,6 +71,7 @@ def _reset_envs(config: TrainConfig, params: EnvParams, at: Difficulty, key: jax
                 params.spacecraft.boresight_B,
                 config.task.scenario.infeasible_zone,
                 max_draws=MAX_DRAWS,
+                keep_angle=True,
             )
         )
 
@@ -112,7 +113,7 @@ def init(config: TrainConfig, key: jax.Array) -> TrainState:
     at = curriculum.difficulty(config.curriculum, jnp.zeros((), jnp.int32))
     states = _reset_envs(config, params, at, key_envs)
     group = jnp.arange(config.num_envs) * _START_GROUPS // config.num_envs
-    states = states.replace(steps=group * config.training_episode_steps // _START_GROUPS)
+    head_start = group * config.training_episode_steps // _START_GROUPS
 
     def random_step(states: EnvState, key_step: jax.Array) -> tuple[EnvState, Transition]:
         key_action, key_reset = jax.random.split(key_step)
@@ -122,12 +123,18 @@ def init(config: TrainConfig, key: jax.Array) -> TrainState:
     example = jax.eval_shape(random_step, states, key_fill)[1]
     buffer = replay.init(example, config.buffer_steps)
 
-    def fill(carry: tuple[EnvState, ReplayBuffer], key_step: jax.Array) -> tuple[tuple[EnvState, ReplayBuffer], None]:
+    def fill(
+        carry: tuple[EnvState, ReplayBuffer], row: tuple[jax.Array, jax.Array]
+    ) -> tuple[tuple[EnvState, ReplayBuffer], None]:
         states, buffer = carry
+        number, key_step = row
         states, transition = random_step(states, key_step)
+        # After the first step, which the environment knows by its number.
+        states = states.replace(steps=states.steps + jnp.where(number == 0, head_start, 0))
         return (states, replay.insert(buffer, transition)), None
 
-    (states, buffer), _ = jax.lax.scan(fill, (states, buffer), jax.random.split(key_fill, config.prefill_steps))
+    fill_keys = jax.random.split(key_fill, config.prefill_steps)
+    (states, buffer), _ = jax.lax.scan(fill, (states, buffer), (jnp.arange(config.prefill_steps), fill_keys))
     return TrainState(
         learner=sac_learner.init(make_sac(config), key_learner),
         buffer=buffer,

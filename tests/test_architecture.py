@@ -60,9 +60,6 @@ def test_sac_knows_nothing_outside_itself():
 
 @pytest.mark.parametrize("name", PHYSICS)
 def test_physics_knows_nothing_of_learning(name):
-    learning = {
-        f"koz_jax.{module}" for module in ("training", "trainer", "refine", "agent", "evaluation", "curriculum")
-    }
     found = reachable(f"koz_jax.{name}")
     assert not found & LEARNING
     assert not any(module.startswith("koz_jax.sac") for module in found)

@@ -142,3 +142,13 @@ def test_no_zone_looks_like_a_margin_of_at_least_half_a_turn(params, drawn):
 def test_at_the_start_the_previous_scalar_part_is_the_present_one(params, drawn):
     found = observe(_state(drawn["q"][0], q_target=drawn["q_target"][0]), params)
     assert found[observation.SLICES["q_e0_previous"]][0] == found[observation.SLICES["q_e"]][0]
+
+
+@pytest.mark.parametrize("axis", [oracle.BORESIGHT, -oracle.BORESIGHT])
+def test_gradient_of_the_observation_is_finite_where_the_boresight_is_along_the_axis(params, axis):
+    state = _state(IDENTITY, axis=axis)
+
+    def observed(q: jax.Array) -> jax.Array:
+        return observation.observe(state.replace(body=state.body.replace(q_BN=q)), params)
+
+    assert np.all(np.isfinite(jax.jit(jax.jacobian(observed))(jnp.array(IDENTITY, jnp.float32))))

@@ -264,6 +264,12 @@ def test_entering_the_band_counts_from_the_first_instant_inside(params):
     np.testing.assert_allclose(result.settling_time, 3.1, rtol=1e-5)
 
 
+def test_a_start_just_outside_the_band_settles_at_the_first_step(params):
+    """0.203 rad at the start, 0.198 rad a step later."""
+    result = _run(IDLE, _scenario(_turned(0.203), omega=(0.0, 0.0, -0.05)), _principal(params, 0.2), 50)
+    np.testing.assert_allclose(result.settling_time, 0.1, rtol=1e-5)
+
+
 def test_settling_counts_from_the_last_entry_into_the_band(params):
     """An oscillation passes through the band again and again before it stays."""
     band = 0.2

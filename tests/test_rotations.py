@@ -18,6 +18,8 @@ from_axis_angle = jax.jit(rotations.from_axis_angle)
 normalize = jax.jit(rotations.normalize)
 cross = jax.jit(rotations.cross)
 dot = jax.jit(rotations.dot)
+norm = jax.jit(rotations.norm)
+norm_gradient = jax.jit(jax.grad(rotations.norm))
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
 
@@ -97,6 +99,7 @@ def test_conjugate_rotates_back(q, v):
 def test_vector_products_agree_with_numpy(a, b):
     np.testing.assert_allclose(cross(a, b), np.cross(a, b), atol=ATOL)
     np.testing.assert_allclose(dot(a, b), a @ b, atol=ATOL)
+    np.testing.assert_allclose(norm(a), np.linalg.norm(a), rtol=1e-6, atol=1e-18)  # squares below 1e-36 may be flushed
 
 
 @given(directions, turns)
@@ -186,3 +189,24 @@ def test_normalize_gives_the_unit_vector_of_the_same_direction(v):
     unit = np.asarray(normalize(v))
     np.testing.assert_allclose(np.linalg.norm(unit), 1.0, atol=ATOL)
     np.testing.assert_allclose(unit * np.linalg.norm(v), v, atol=ATOL)
+
+
+# Refinement differentiates through whole maneuvers, which pass through the points where a norm has a kink.
+
+
+@pytest.mark.parametrize("size", [3, 4])
+def test_gradient_of_the_norm_is_zero_at_zero(size):
+    np.testing.assert_array_equal(jax.grad(rotations.norm)(np.zeros(size, np.float32)), 0.0)
+
+
+@given(_vectors(3, least=1e-3))
+def test_gradient_of_the_norm_is_the_unit_vector(v):
+    np.testing.assert_allclose(norm_gradient(v), v.astype(np.float64) / np.linalg.norm(v.astype(np.float64)), atol=1e-5)
+
+
+def test_gradients_of_the_angles_are_finite_at_zero_and_at_half_a_turn():
+    x = np.array([1.0, 0.0, 0.0], np.float32)
+    for q in (IDENTITY, -IDENTITY, np.array([0.0, 0.0, 1.0, 0.0], np.float32)):
+        assert np.all(np.isfinite(jax.grad(rotations.rotation_angle)(q)))
+    for b in (x, -x):
+        assert np.all(np.isfinite(np.array(jax.grad(rotations.angle_between, argnums=(0, 1))(x, b))))

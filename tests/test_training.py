@@ -320,13 +320,17 @@ def test_prefill_acts_uniformly_and_training_acts_by_its_policy(steps, flight):
 
 
 def test_no_key_is_used_twice():
-    """By jax's own checker, which looks at the traced program."""
+    """By jax's own checker, which looks at the traced program: a start and two steps."""
     params = task.env_params(CONFIG.task)
-    init = functools.partial(training.init, CONFIG)
-    state = jax.eval_shape(init, KEY)
+
+    def program(key):
+        state = training.init(CONFIG, key)
+        for _ in range(2):
+            state, _ = training.train_step(CONFIG, params, state)
+        return state
+
     with jax.debug_key_reuse(True):
-        jax.jit(init).trace(KEY)
-        jax.jit(lambda state: training.train_step(CONFIG, params, state)).trace(state)
+        jax.jit(program).trace(KEY)
         with pytest.raises(jax.errors.KeyReuseError):  # it does look
             jax.jit(lambda key: jax.random.normal(key) + jax.random.uniform(key)).trace(KEY)
 

@@ -1,15 +1,8 @@
 """The three losses of Soft Actor-Critic with a learned entropy coefficient (arXiv:1812.05905)."""
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 from flax import struct
-
-from koz_jax.sac.networks import Params, SquashedGaussian
-
-PolicyFn = Callable[[Params, jax.Array], SquashedGaussian]
-CriticFn = Callable[[Params, jax.Array, jax.Array], jax.Array]
 
 
 class Batch(struct.PyTreeNode):

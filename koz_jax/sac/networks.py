@@ -14,7 +14,7 @@ Encoding = tuple[tuple[int, int, float], ...]  # (start, stop, scale): also feed
 LOG_STD_MIN = -20.0
 LOG_STD_MAX = 2.0
 
-# Weights uniform in +-1 / sqrt(inputs): the initialisation of torch.nn.Linear, hence of Stable-Baselines3.
+# Weights uniform in +-1 / sqrt(inputs), as torch.nn.Linear and hence Stable-Baselines3 has it; biases start at zero.
 _kernel_init = nn.initializers.variance_scaling(1.0 / 3.0, "fan_in", "uniform")
 
 

@@ -43,6 +43,13 @@ def insert(buffer: ReplayBuffer, row: Transition) -> ReplayBuffer:
     return ReplayBuffer(rows=rows, head=(buffer.head + 1) % steps, size=jnp.minimum(buffer.size + 1, steps))
 
 
+def seal(buffer: ReplayBuffer) -> ReplayBuffer:
+    """Cut the newest row's episodes, so that no window runs on into rows of other environments."""
+    newest = (buffer.head - 1) % buffer.rows.truncated.shape[0]
+    truncated = buffer.rows.truncated.at[newest].set(True)
+    return buffer.replace(rows=buffer.rows.replace(truncated=truncated))
+
+
 def sample_windows(buffer: ReplayBuffer, key: jax.Array, count: int, length: int) -> Transition:
     """Draw runs of consecutive steps of one environment, uniformly.
 
@@ -61,7 +68,8 @@ def n_step_batch(window: Transition, reward: jax.Array, discount: jax.Array | fl
     """Sum the rewards of each window up to the end of its episode.
 
     window: leaves (length, count, ...); reward: (length, count); discount: gamma per step.  A window that is cut by
-    a truncation bootstraps from the true observation at the cut, one that terminates does not bootstrap.
+    a truncation bootstraps from the true observation at the cut, one that terminates does not bootstrap.  As is usual,
+    the entropy of the steps inside a window is left out, and their actions are not corrected for being older.
     """
     length = reward.shape[0]
     ended = window.terminated | window.truncated

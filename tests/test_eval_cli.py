@@ -1,0 +1,212 @@
+"""``eval_mc.py`` as a user meets it: its table, its files, its errors."""
+
+import csv
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tiny
+
+from koz_jax import evaluation
+from koz_jax.run_folder import RunFolder
+
+JSON_KEYS = [
+    *("cases", "seed", "agent", "mean_reward", "std_reward", "settling_time_mean", "settling_time_std"),
+    *("control_effort_mean", "control_effort_std", "control_accuracy_deg_mean", "control_accuracy_deg_std"),
+    *("non_settled_rate", "violation_rate", "success_rate", "compile_s", "wall_s"),
+]
+
+
+@pytest.fixture(scope="module")
+def run() -> RunFolder:
+    """A finished run; read it, do not change it."""
+    return tiny.finished_run()
+
+
+@pytest.fixture
+def agent(tmp_path) -> Path:
+    """Folder of an agent that nobody trained."""
+    tiny.untrained_agent().save(tmp_path / "agent")
+    return tmp_path / "agent"
+
+
+@pytest.fixture(autouse=True)
+def empty_cwd(tmp_path, monkeypatch) -> Path:
+    """An empty folder to work in."""
+    (tmp_path / "cwd").mkdir()
+    monkeypatch.chdir(tmp_path / "cwd")
+    monkeypatch.setenv("COLUMNS", "300")  # so that no message is wrapped
+    return tmp_path / "cwd"
+
+
+@pytest.fixture
+def no_flight(monkeypatch) -> None:
+    """Make an error of any flight."""
+    for name in ("_fly_cases", "_fly_and_judge"):
+        monkeypatch.setattr(evaluation, name, lambda *_, **__: pytest.fail("something was flown"))
+
+
+def refused(capsys: Any, *argv: object) -> str:
+    """What a command line that is refused says."""
+    assert tiny.status("eval_mc", *argv) == 2
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert "Traceback" not in output.err
+    assert 0 < len(output.err.splitlines()) <= 14
+    return output.err
+
+
+# Arguments, and what the message must say: the field, the value, what is allowed.
+BAD = [
+    ("--cases 0", ["cases: must be from 1 to 2^31 - 1, got 0"]),
+    ("--cases -5", ["cases: must be from 1 to 2^31 - 1, got -5"]),
+    ("--cases 1.5", ["--cases", "1.5", "int"]),
+    ("--seed -1", ["seed: must be from 0 to 2^32 - 1, got -1"]),
+    ("--min-angle-deg nan", ["min_angle_deg: must be in [0, 180], got nan"]),
+    ("--max-angle-deg inf", ["max_angle_deg: must be in [min_angle_deg = 80.0, 180], got inf"]),
+    ("--min-angle-deg 170 --max-angle-deg 100", ["max_angle_deg: must be in [min_angle_deg = 170.0, 180], got 100.0"]),
+    ("--min-angle-deg 10 --max-angle-deg 30", ["max_angle_deg: must be above 34 deg", "got 30", "shrink"]),
+    ("--substeps 0", ["substeps: must be from 1 to 100, got 0"]),
+    ("--angle-convention quarter", ["--angle-convention", "quarter", "full", "half"]),
+    ("--infeasible-zone skip", ["--infeasible-zone", "skip", "resample", "shrink"]),
+    ("--replay-case 10000", ["replay_case: must be from 0 to cases - 1 = 9999, got 10000"]),
+    ("--replay-case 5 --cases 5", ["replay_case: must be from 0 to cases - 1 = 4, got 5"]),
+    ("--replay-case -1", ["replay_case: must be from 0 to cases - 1 = 9999, got -1"]),
+    ("--replay-case abc", ["--replay-case", "abc", "int"]),
+    ("--replay-case 1 --json x.json", ["json: is not written with --replay-case", "x.json"]),
+    ("--replay-case 1 --csv x.csv", ["csv: is not written with --replay-case", "x.csv"]),
+    ("--replay-case 1 --history nowhere/x.csv", ["history: the folder nowhere of nowhere/x.csv does not exist"]),
+    ("--history x.csv", ["history: is written by --replay-case only, got x.csv"]),
+    ("--json nowhere/x.json", ["json: the folder nowhere of nowhere/x.json does not exist"]),
+    ("--csv nowhere/x.csv", ["csv: the folder nowhere of nowhere/x.csv does not exist"]),
+    ("--json .", ["json: . must be a new or an ordinary file"]),
+    ("--csv /dev/null", ["csv: /dev/null must be a new or an ordinary file"]),
+    ("--colour red", ["--colour"]),
+]
+
+
+@pytest.mark.parametrize(("argv", "words"), BAD, ids=[argv for argv, _ in BAD])
+@pytest.mark.usefixtures("no_flight")
+def test_bad_input_is_refused_by_name_before_anything_happens(capsys, agent, empty_cwd, argv, words):
+    message = refused(capsys, "--agent", agent, *argv.split())
+    for word in words:
+        assert word in message
+    assert list(empty_cwd.iterdir()) == []
+
+
+@pytest.mark.usefixtures("no_flight")
+def test_an_unwritable_place_is_refused(capsys, agent):
+    if not Path("/proc/self").exists():
+        pytest.skip("needs a folder in which not even root can write")
+    for name in ("json", "csv"):
+        message = refused(capsys, "--agent", agent, f"--{name}", f"/proc/x.{name}")
+        assert f"{name}: /proc/x.{name} cannot be written: " in message
+
+
+@pytest.mark.parametrize("name", ["nobody", "", ".", "nowhere/run"])
+@pytest.mark.usefixtures("no_flight")
+def test_an_unknown_agent_is_refused_and_the_known_are_listed(capsys, monkeypatch, name):
+    monkeypatch.setattr("koz_jax.agent.shipped_agents", lambda: ("alpha", "beta"))
+    message = refused(capsys, "--agent", name)
+    assert message.startswith(f"error: agent: {name!r} is neither a shipped agent (alpha, beta) nor a folder with")
+
+
+@pytest.mark.usefixtures("no_flight")
+def test_a_damaged_agent_is_refused(capsys, agent):
+    (agent / "arrays.npz").write_bytes(b"")
+    assert f"{agent}/arrays.npz: damaged" in refused(capsys, "--agent", agent)
+    (agent / "record.json").write_text("{")
+    assert f"{agent}/record.json: cannot be read as JSON" in refused(capsys, "--agent", agent)
+
+
+def test_help_describes_every_flag(capsys):
+    assert tiny.status("eval_mc", "--help") == 0
+    text = capsys.readouterr().out
+    assert set(re.findall(r"--[a-z][a-z-]+", text)) == {
+        *("--help", "--agent", "--cases", "--seed", "--min-angle-deg", "--max-angle-deg", "--angle-convention"),
+        *("--infeasible-zone", "--substeps", "--json", "--csv", "--replay-case", "--history"),
+    }
+    for line in text.splitlines():
+        if re.match(r"[│| ]*--[a-z]", line):
+            assert re.search(r"--[a-z-]+ .*?[A-Z]\S* .*[a-z]", line), line
+
+
+def test_table_json_and_csv_tell_the_same(capsys, run, empty_cwd):
+    argv = ["--agent", run.path, "--cases", tiny.CASES, "--seed", 5, "--json", "x.json", "--csv", "x.csv"]
+    assert tiny.status("eval_mc", *argv) == 0
+    output = capsys.readouterr().out
+    text = (empty_cwd / "x.json").read_text()
+    report = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    assert list(report) == JSON_KEYS
+    assert (report["cases"], report["seed"], report["agent"]) == (tiny.CASES, 5, str(run.path))
+    # Two seconds are too short to settle: what is over settled cases only is null.
+    assert report["non_settled_rate"] == 1.0 and report["success_rate"] == 0.0
+    assert [name for name in JSON_KEYS if report[name] is None] == [
+        name for name in JSON_KEYS if "control" in name or "settling" in name
+    ][:6]
+
+    rows = list(csv.DictReader((empty_cwd / "x.csv").read_text().splitlines()))
+    assert [int(row["case"]) for row in rows] == list(range(tiny.CASES))
+    rewards = np.array([float(row["reward"]) for row in rows])
+    np.testing.assert_allclose(rewards.mean(), report["mean_reward"], rtol=1e-6)
+    np.testing.assert_allclose(rewards.std(), report["std_reward"], rtol=1e-6)
+    assert np.mean([int(row["violated"]) for row in rows]) == report["violation_rate"]
+    assert np.mean([row["settled"] == "0" for row in rows]) == report["non_settled_rate"]
+
+    assert f"{report['mean_reward']:.2f} +- {report['std_reward']:.2f}" in output
+    assert "7281.91 +- 688.85" in output  # the paper's
+    assert re.search(r"not settled .*100\.00 %  \[\d+\.\d\d, 100\.00\]", output)
+    assert re.search(r"compiled in \d+\.\d s, flown in \d+\.\d s", output)
+    assert sorted(path.name for path in empty_cwd.iterdir()) == ["x.csv", "x.json"]
+
+
+def test_files_are_replaced_whole(agent, empty_cwd):
+    (empty_cwd / "x.json").write_text("old" * 10_000)
+    assert tiny.status("eval_mc", "--agent", agent, "--cases", tiny.CASES, "--json", "x.json") == 0
+    assert json.loads((empty_cwd / "x.json").read_text())["cases"] == tiny.CASES
+
+
+def test_a_replayed_case_ends_like_its_row(capsys, run, empty_cwd):
+    draw = ["--agent", run.path, "--cases", tiny.CASES, "--seed", 5]
+    assert tiny.status("eval_mc", *draw, "--csv", "all.csv") == 0
+    assert tiny.status("eval_mc", *draw, "--replay-case", 3) == 0
+    assert tiny.status("eval_mc", *draw, "--replay-case", 3, "--history", "other.csv") == 0
+    rows = list(csv.DictReader((empty_cwd / "all.csv").read_text().splitlines()))
+    history = list(csv.DictReader((empty_cwd / "case-3.csv").read_text().splitlines()))
+    row, start, end = rows[3], history[0], history[-1]
+    assert float(start["phi_deg"]) == pytest.approx(float(row["initial_angle_deg"]), rel=1e-5)
+    assert float(end["phi_deg"]) == pytest.approx(float(row["control_accuracy_deg"]), rel=1e-4)
+    margins = [float(instant["theta_margin_deg"]) for instant in history]
+    assert min(margins) == pytest.approx(float(row["min_margin_deg"]), rel=1e-4)
+    effort = sum(0.1 * float(instant[f"torque_{axis}_Nm"]) ** 2 for instant in history[:-1] for axis in "xyz")
+    assert effort == pytest.approx(float(row["control_effort_N2m2s"]), rel=1e-4)
+    assert (empty_cwd / "other.csv").read_text() == (empty_cwd / "case-3.csv").read_text()
+    output = capsys.readouterr().out
+    assert f"case 3: {float(row['initial_angle_deg']):.1f} deg, not settled" in output
+    assert "history: case-3.csv" in output and "history: other.csv" in output
+
+
+def test_the_rules_can_be_changed(capsys, agent, empty_cwd):
+    argv = ["--agent", agent, "--cases", tiny.CASES]
+    for convention in ("full", "half"):
+        assert tiny.status("eval_mc", *argv, "--angle-convention", convention, "--csv", f"{convention}.csv") == 0
+    full, half = (
+        [
+            float(row["control_accuracy_deg"])
+            for row in csv.DictReader((empty_cwd / f"{name}.csv").read_text().splitlines())
+        ]
+        for name in ("full", "half")
+    )
+    np.testing.assert_allclose(half, 0.5 * np.array(full), rtol=1e-6)
+
+
+def test_the_command_itself(run, empty_cwd):
+    done = tiny.run_python(
+        tiny.ROOT / "eval_mc.py", "--agent", run.path, "--cases", 12, "--json", "x.json", cwd=empty_cwd
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "12 cases" in done.stdout
+    assert list(json.loads((empty_cwd / "x.json").read_text())) == JSON_KEYS
