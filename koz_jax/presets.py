@@ -71,12 +71,11 @@ def _fast() -> TrainConfig:
             phase1=PhaseConfig(
                 updates=40_000,
                 max_angle_deg=((0.0, 10.0), (0.75, 180.0)),
-                angle_bias=constant(2.0),
                 learning_rate=constant(5e-4),
             ),
             phase2=PhaseConfig(
                 updates=120_000,
-                min_angle_deg=constant(20.0),
+                min_angle_deg=constant(60.0),
                 zone_weight=((0.0, 0.5), (0.1, 2.0)),
                 zone_tightening_deg=constant(1.25),
                 zone_steepness=constant(2.0),
