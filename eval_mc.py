@@ -13,8 +13,8 @@ from koz_jax.errors import UserError, exit_status
 
 if TYPE_CHECKING:
     from koz_jax.agent import Agent
-    from koz_jax.config import TaskConfig
     from koz_jax.evaluation import MonteCarloConfig
+    from koz_jax.task_config import TaskConfig
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,11 +21,12 @@ import jax.numpy as jnp
 
 from koz_jax import env, evaluation, observation, reward, runtime, scenario, task, training
 from koz_jax.agent import Agent, PolicyController, Provenance, policy_network
-from koz_jax.config import NetworkConfig, TaskConfig
+from koz_jax.config import NetworkConfig
 from koz_jax.evaluation import MonteCarloConfig
 from koz_jax.presets import preset
 from koz_jax.sac import learner
 from koz_jax.sac.losses import Batch
+from koz_jax.task_config import TaskConfig
 
 CASES = 10_000
 UPDATES = 200

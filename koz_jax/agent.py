@@ -11,9 +11,11 @@ from flax import struct
 from pydantic import Field, ValidationError
 
 from koz_jax import observation, storage, task
-from koz_jax.config import NetworkConfig, Settings, TaskConfig
+from koz_jax.config import NetworkConfig
 from koz_jax.errors import UserError, explain
 from koz_jax.sac.networks import Params, Policy
+from koz_jax.settings import Settings
+from koz_jax.task_config import TaskConfig
 
 ACTION_SIZE = 3
 

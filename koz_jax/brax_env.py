@@ -11,8 +11,8 @@ import jax.numpy as jnp
 
 from koz_jax import env, observation, reward, scenario, task
 from koz_jax.agent import ACTION_SIZE
-from koz_jax.config import TaskConfig
 from koz_jax.env import EnvState
+from koz_jax.task_config import TaskConfig
 
 # brax prints to stdout, while it is imported, which optional engines it could not find.
 with contextlib.redirect_stdout(io.StringIO()):

@@ -1,4 +1,4 @@
-"""Every setting of the project, declared and validated once.  Imports no jax: a bad setting costs no compute.
+"""Settings of training, declared and validated once.  Imports no jax: a bad setting costs no compute.
 
 All classes are frozen and hashable (they are static arguments of jitted functions) and go to and from JSON.
 Angles are in degrees here, where people write them, and in radians everywhere else.
@@ -6,162 +6,25 @@ Angles are in degrees here, where people write them, and in radians everywhere e
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Self
 
-import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import model_validator
 
-PositiveFloat = Annotated[float, Field(gt=0)]
-NonNegativeFloat = Annotated[float, Field(ge=0)]
-# Counts are int32 on the device, and so are the bits of a seed.
-PositiveInt = Annotated[int, Field(gt=0, lt=2**31)]
-NonNegativeInt = Annotated[int, Field(ge=0, lt=2**31)]
-Seed = Annotated[int, Field(ge=0, lt=2**32)]
-Fraction = Annotated[float, Field(gt=0, le=1)]
-HalfAngleDeg = Annotated[float, Field(gt=0, lt=180)]
-DeviationDeg = Annotated[float, Field(ge=0, le=180)]
-Vector = tuple[float, float, float]
-
-
-def _check_ramp(ramp: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
-    fractions = [fraction for fraction, _ in ramp]
-    if not ramp or fractions != sorted(set(fractions)) or fractions[0] < 0 or fractions[-1] > 1:
-        raise ValueError("a ramp needs one or more (fraction, value) pairs with fractions rising strictly in [0, 1]")
-    return ramp
-
-
-def _check_steps(name: str, seconds: float, step_seconds: float) -> None:
-    if not 0.5 < seconds / step_seconds < 2**31 - 1:
-        raise ValueError(f"{name} must hold 1 to 2^31 - 1 steps of step_seconds = {step_seconds}; got {seconds}")
-
-
-# Piecewise linear in the fraction of the phase that is done, constant before the first and after the last pair.
-Ramp = Annotated[tuple[tuple[float, float], ...], AfterValidator(_check_ramp)]
-
-
-def constant(value: float) -> Ramp:
-    """Make a ramp that stays at one value."""
-    return ((0.0, value),)
-
-
-class Settings(BaseModel):
-    """Base of all settings: immutable, no unknown fields, no infinities."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
-
-
-class SpacecraftConfig(Settings):
-    """The spacecraft (section 2.5 of the paper)."""
-
-    inertia: tuple[Vector, Vector, Vector] = ((60.0, 5.0, 1.0), (5.0, 50.0, 2.0), (1.0, 2.0, 70.0))
-    """Inertia tensor in body axes, row by row [kg m^2]."""
-    boresight: Vector = (1.0, 0.0, 0.0)
-    """Unit vector of the telescope in body axes."""
-    torque_limit: PositiveFloat = 2.0
-    """Largest torque about each body axis [N m]."""
-
-    @model_validator(mode="after")
-    def _physical(self) -> Self:
-        inertia = np.array(self.inertia)
-        if not np.allclose(inertia, inertia.T, rtol=1e-6, atol=0.0):
-            raise ValueError(f"inertia must be symmetric; got {self.inertia}")
-        principal = np.linalg.eigvalsh(inertia)
-        if principal[0] <= 0:
-            raise ValueError(f"inertia must be positive definite; its principal moments are {principal.tolist()}")
-        if principal[0] + principal[1] < principal[2] * (1 - 1e-6):
-            raise ValueError(
-                "inertia must obey the triangle inequality (no principal moment above the sum of the other two);"
-                f" its principal moments are {principal.tolist()}"
-            )
-        length = float(np.linalg.norm(self.boresight))
-        if abs(length - 1.0) > 1e-6:
-            raise ValueError(f"boresight must be a unit vector; {self.boresight} has length {length:.6g}")
-        return self
-
-
-class RewardConfig(Settings):
-    """Constants of the reward (Eq. 7 to 9 of the paper)."""
-
-    attitude_scale: PositiveFloat = 0.14 * 2 * np.pi
-    """Scale of exp(-phi / scale) [rad]."""
-    settled_angle_deg: PositiveFloat = 0.25
-    """Accuracy asked for: the maneuver is settled while phi is at most this [deg]."""
-    settled_bonus: float = 9.0
-    """Reward per step for being settled."""
-    torque_cost: float = 0.05
-    """Cost per step of |tau| / |tau_max|."""
-    torque_change_cost: float = 0.005
-    """Cost per step of the torque's change [1 / (N m)]."""
-    zone_height: NonNegativeFloat = 10.0
-    """beta: penalty per step inside the zone."""
-    zone_decay: PositiveFloat = 66.0
-    """alpha: how fast the penalty falls with the margin [1 / rad]."""
-    no_progress_cost: float = 1.0
-    """Cost of a step that does not bring the attitude closer."""
-    progress_tolerance_deg: NonNegativeFloat = 0.0
-    """Growth of phi in a step that still counts as progress [deg]; the paper counts a tie as none."""
-
-
-class ScenarioConfig(Settings):
-    """What scenarios are drawn (the deviation range comes from the curriculum or the evaluation)."""
-
-    max_rate_deg: NonNegativeFloat = 0.001
-    """Initial rates are uniform in plus or minus this, per axis [deg/s]."""
-    min_half_angle_deg: HalfAngleDeg = 15.0
-    """Smallest half angle of the keep-out zone [deg]."""
-    max_half_angle_deg: HalfAngleDeg = 30.0
-    """Largest half angle of the keep-out zone [deg]."""
-    separation_deg: NonNegativeFloat = 2.0
-    """Least angle between the zone's edge and the boresight at start and at target [deg]."""
-    infeasible_zone: Literal["resample", "shrink"] = "resample"
-    """Where the zone would hold start or target: draw the case again, or make the zone smaller."""
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if self.min_half_angle_deg > self.max_half_angle_deg:
-            raise ValueError(
-                f"min_half_angle_deg must be at most max_half_angle_deg; got {self.min_half_angle_deg} and"
-                f" {self.max_half_angle_deg}"
-            )
-        return self
-
-
-class TaskConfig(Settings):
-    """The maneuver: what is flown, and how it is judged."""
-
-    spacecraft: SpacecraftConfig = SpacecraftConfig()
-    """The body that turns, and its telescope."""
-    reward: RewardConfig = RewardConfig()
-    """What a step is worth."""
-    scenario: ScenarioConfig = ScenarioConfig()
-    """Where maneuvers start, and the zone in their way."""
-    step_seconds: PositiveFloat = 0.1
-    """Time step; the torque is held over it [s]."""
-    episode_seconds: PositiveFloat = 100.0
-    """Length of a maneuver in evaluation [s]."""
-    angle_convention: Literal["full", "half"] = "full"
-    """phi is the full rotation angle, or half of it (the literal equation of the paper)."""
-
-    @property
-    def episode_steps(self) -> int:
-        """Steps of a maneuver."""
-        return round(self.episode_seconds / self.step_seconds)
-
-    def with_rules(
-        self, angle_convention: Literal["full", "half"] | None, infeasible_zone: Literal["resample", "shrink"] | None
-    ) -> TaskConfig:
-        """Judge the same task by another angle convention, or draw it by another rule; None keeps what is set."""
-        changed = self.model_dump()
-        if angle_convention is not None:
-            changed["angle_convention"] = angle_convention
-        if infeasible_zone is not None:
-            changed["scenario"]["infeasible_zone"] = infeasible_zone
-        return TaskConfig.model_validate(changed)
-
-    @model_validator(mode="after")
-    def _whole_steps(self) -> Self:
-        _check_steps("episode_seconds", self.episode_seconds, self.step_seconds)
-        return self
+from koz_jax.settings import (
+    DeviationDeg,
+    Fraction,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    Ramp,
+    Seed,
+    Settings,
+    check_steps,
+    constant,
+    ramp_value,
+)
+from koz_jax.task_config import TaskConfig
 
 
 class EncodingConfig(Settings):
@@ -259,12 +122,6 @@ _RAMP_BOUNDS = {
     "discount": (0.0, 0.99999),
     "learning_rate": (0.0, 1.0),
 }
-
-
-def ramp_value(ramp: Ramp, fraction: float) -> float:
-    """Value of a ramp at a fraction of its phase."""
-    fractions, values = zip(*ramp, strict=True)
-    return float(np.interp(fraction, fractions, values))
 
 
 class CurriculumConfig(Settings):
@@ -402,8 +259,8 @@ class TrainConfig(Settings):
                 raise ValueError(
                     f"{name} must be a multiple of updates_per_step = {self.updates_per_step}; got {value}"
                 )
-        _check_steps("training_episode_seconds", self.training_episode_seconds, self.task.step_seconds)
-        _check_steps("refine.horizon_seconds", self.refine.horizon_seconds, self.task.step_seconds)
+        check_steps("training_episode_seconds", self.training_episode_seconds, self.task.step_seconds)
+        check_steps("refine.horizon_seconds", self.refine.horizon_seconds, self.task.step_seconds)
         if self.eval_min_angle_deg > self.eval_max_angle_deg:
             raise ValueError(
                 "eval_min_angle_deg must be at most eval_max_angle_deg; got"

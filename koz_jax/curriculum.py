@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from koz_jax.config import CurriculumConfig, PhaseConfig, Ramp
+from koz_jax.config import CurriculumConfig, PhaseConfig
 from koz_jax.reward import PAPER_WEIGHTS, RewardParams, RewardTerms
+from koz_jax.settings import Ramp
 
 
 class Difficulty(struct.PyTreeNode):

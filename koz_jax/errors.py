@@ -1,5 +1,6 @@
 """Errors that a user can act on, and how the command lines show them: a line each, without a traceback."""
 
+import os
 import reprlib
 import sys
 from collections.abc import Callable
@@ -24,13 +25,17 @@ def explain(error: ValidationError) -> str:
 
 
 def exit_status(command: Callable[[], int]) -> int:
-    """Run a command line.  Returns its exit status: 2 after an error of the user, 130 after Ctrl-C."""
+    """Run a command line.  Returns its exit status; as in a shell, 130 after Ctrl-C and 141 when nobody reads on."""
     try:
         return command()
     except (ValidationError, UserError) as error:
         message = explain(error) if isinstance(error, ValidationError) else str(error)
         print("\n".join(f"error: {line}" for line in message.splitlines()), file=sys.stderr)
         return 2
+    except BrokenPipeError:
+        # The reader of the output has left (``train.py --help | head``); nor may Python's last flush complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130

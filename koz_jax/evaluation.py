@@ -17,12 +17,12 @@ from jax.sharding import Mesh, PartitionSpec
 
 from koz_jax import rollout, scenario, task
 from koz_jax.agent import Agent
-from koz_jax.config import TaskConfig
 from koz_jax.env import EnvParams
 from koz_jax.errors import UserError
 from koz_jax.rollout import CaseResult, Controller
 from koz_jax.scenario import InfeasibleRule, Scenario, ScenarioRanges
 from koz_jax.summary import Summary
+from koz_jax.task_config import TaskConfig
 
 # Cases that a device flies together: enough to fill the vector units, few enough to stay in its cache.
 _CHUNK = 500

@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from koz_jax.config import Settings
+from koz_jax.settings import Settings
 
 SettingsType = TypeVar("SettingsType", bound=Settings)
 Others = TypeVar("Others")

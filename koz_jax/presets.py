@@ -8,9 +8,9 @@ from koz_jax.config import (
     RefineConfig,
     SacConfig,
     TrainConfig,
-    constant,
 )
 from koz_jax.errors import UserError
+from koz_jax.settings import constant
 
 
 def _paper() -> TrainConfig:

@@ -9,6 +9,7 @@
 """
 
 import dataclasses
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -93,7 +94,7 @@ class RunFolder:
 
     def read_config(self) -> TrainConfig:
         """Read the configuration of an existing run."""
-        if not self.config.is_file():
+        if not os.path.isfile(self.config):
             raise UserError(f"resume: {self.path} is not a run folder (it has no {self.config.name})")
         try:
             return TrainConfig.model_validate(storage.read_json(self.config))

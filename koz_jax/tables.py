@@ -6,8 +6,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from koz_jax.config import TaskConfig
 from koz_jax.rollout import CaseResult, History
+from koz_jax.task_config import TaskConfig
 
 
 def _csv(columns: dict[str, np.ndarray]) -> str:

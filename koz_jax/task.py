@@ -3,12 +3,13 @@
 import jax.numpy as jnp
 
 from koz_jax import observation
-from koz_jax.config import EncodingConfig, ScenarioConfig, TaskConfig
+from koz_jax.config import EncodingConfig
 from koz_jax.dynamics import Spacecraft
 from koz_jax.env import EnvParams
 from koz_jax.reward import RewardParams
 from koz_jax.sac.networks import Encoding
 from koz_jax.scenario import ScenarioRanges
+from koz_jax.task_config import ScenarioConfig, TaskConfig
 
 
 def env_params(task: TaskConfig) -> EnvParams:

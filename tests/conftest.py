@@ -7,8 +7,8 @@ import pytest
 from hypothesis import settings
 
 from koz_jax import task
-from koz_jax.config import TaskConfig
 from koz_jax.env import EnvParams
+from koz_jax.task_config import TaskConfig
 
 # The first example of a property compiles; a deadline would measure that.
 settings.register_profile("koz_jax", deadline=None, derandomize=True, max_examples=50)

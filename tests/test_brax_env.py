@@ -1,5 +1,6 @@
 import subprocess
 import sys
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import pytest
 
 from koz_jax import env, observation, reward, task
 from koz_jax.brax_env import ReorientationEnv
-from koz_jax.config import TaskConfig
+from koz_jax.task_config import TaskConfig
 
 TASK = TaskConfig(episode_seconds=2.0)
 ENV = ReorientationEnv(TASK)
@@ -21,16 +22,16 @@ def test_import_is_silent():
 
 def test_rewards_and_observations_are_those_of_the_core():
     params = task.env_params(TASK)
-    state = ENV.reset(jax.random.key(3))
-    core = state.pipeline_state
+    state: Any = ENV.reset(jax.random.key(3))
+    core: Any = state.pipeline_state
     for key in jax.random.split(jax.random.key(4), 10):
         action = jax.random.uniform(key, (ENV.action_size,), minval=-1.0, maxval=1.0)
         state = ENV.step(state, action)
         core, outcome = env.step(core, action, params)
         terms = reward.terms(outcome, params.reward, params.spacecraft.torque_limit)
         np.testing.assert_allclose(state.reward, reward.total(terms, reward.PAPER_WEIGHTS), rtol=1e-6)
-        np.testing.assert_allclose(state.obs, observation.observe(core, params), rtol=1e-6)
-    assert state.obs.shape == (ENV.observation_size,)
+        np.testing.assert_allclose(jnp.asarray(state.obs), observation.observe(core, params), rtol=1e-6)
+    assert jnp.shape(state.obs) == (ENV.observation_size,)
 
 
 def test_typed_and_raw_keys_draw_the_same_scenario():

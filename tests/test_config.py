@@ -8,8 +8,10 @@ import pytest
 from pydantic import ValidationError
 
 from koz_jax import presets
-from koz_jax.config import Settings, TaskConfig, TrainConfig, constant, ramp_value
+from koz_jax.config import TrainConfig
 from koz_jax.errors import UserError, exit_status, explain
+from koz_jax.settings import Settings, constant, ramp_value
+from koz_jax.task_config import TaskConfig
 
 FAST = presets.preset("fast")
 

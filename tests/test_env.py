@@ -6,12 +6,12 @@ import pytest
 from flax import struct
 
 from koz_jax import env, observation, task
-from koz_jax.config import TaskConfig
 from koz_jax.dynamics import RigidBodyState, Spacecraft
 from koz_jax.env import EnvParams, EnvState
 from koz_jax.keep_out import KeepOutZone
 from koz_jax.reward import Outcome
 from koz_jax.scenario import Scenario
+from koz_jax.task_config import TaskConfig
 
 pytestmark = pytest.mark.usefixtures("strict_shapes")
 

@@ -13,13 +13,13 @@ import pytest
 import tiny
 
 from koz_jax import evaluation, storage, tables
-from koz_jax.config import TaskConfig
 from koz_jax.errors import UserError
 from koz_jax.evaluation import MonteCarlo, MonteCarloConfig, monte_carlo
 from koz_jax.reward import PAPER_WEIGHTS
 from koz_jax.rollout import CaseResult
 from koz_jax.scenario import Scenario
 from koz_jax.summary import summarise
+from koz_jax.task_config import TaskConfig
 
 REPORT_KEYS = [
     "cases",

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from koz_jax import presets
-from koz_jax.config import EncodingConfig, PhaseConfig, ScenarioConfig, TrainConfig, ramp_value
+from koz_jax.config import EncodingConfig, PhaseConfig, TrainConfig
 from koz_jax.errors import UserError
+from koz_jax.settings import ramp_value
+from koz_jax.task_config import ScenarioConfig
 
 PAPER = presets.preset("paper")
 FRACTIONS = np.linspace(0.0, 1.0, 101)

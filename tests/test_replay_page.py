@@ -15,7 +15,6 @@ from tiny import CONFIG, finished_run, untrained_agent
 
 from koz_jax import env, scenario, task
 from koz_jax.agent import Agent
-from koz_jax.config import TaskConfig
 from koz_jax.errors import UserError
 from koz_jax.evaluation import MonteCarloConfig, draw_case, fly_case
 from koz_jax.figures import geometry
@@ -23,6 +22,7 @@ from koz_jax.keep_out import KeepOutZone
 from koz_jax.replay import __main__ as command
 from koz_jax.replay import body, page
 from koz_jax.replay.maneuver import Clock, Maneuver, clock, fly
+from koz_jax.task_config import TaskConfig
 
 PAPER = scenario.paper_test()
 LONGEST = 6e6  # bytes

@@ -7,12 +7,12 @@ import oracle
 import pytest
 
 from koz_jax import env, reward, task
-from koz_jax.config import TaskConfig
 from koz_jax.dynamics import RigidBodyState
 from koz_jax.env import EnvParams
 from koz_jax.keep_out import NO_ZONE_HALF_ANGLE, KeepOutZone
 from koz_jax.reward import PAPER_WEIGHTS, Outcome, RewardParams, RewardTerms
 from koz_jax.scenario import Scenario
+from koz_jax.task_config import TaskConfig
 
 pytestmark = pytest.mark.usefixtures("strict_shapes")
 

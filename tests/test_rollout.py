@@ -9,13 +9,13 @@ import pytest
 from flax import struct
 
 from koz_jax import observation, reward, rollout, scenario, task
-from koz_jax.config import TaskConfig
 from koz_jax.dynamics import RigidBodyState
 from koz_jax.env import EnvParams
 from koz_jax.keep_out import NO_ZONE_HALF_ANGLE, KeepOutZone
 from koz_jax.reward import RewardTerms
 from koz_jax.rollout import CaseResult, History
 from koz_jax.scenario import Scenario
+from koz_jax.task_config import TaskConfig
 
 pytestmark = pytest.mark.usefixtures("strict_shapes")
 

@@ -9,8 +9,8 @@ import pytest
 from scipy import stats
 
 from koz_jax import scenario, task
-from koz_jax.config import ScenarioConfig
 from koz_jax.scenario import Scenario, ScenarioRanges
+from koz_jax.task_config import ScenarioConfig
 
 pytestmark = pytest.mark.usefixtures("strict_shapes")
 

@@ -17,8 +17,8 @@ def phase2_summary():
     return summarise(evaluation.fly_cases(agent.controller, agent.task, CASES))
 
 
-def test_the_shipped_agents_are_the_two_phases():
-    assert shipped_agents() == ("phase1", "phase2")
+def test_the_shipped_agents_are_the_two_phases_and_phase_2_before_refinement():
+    assert shipped_agents() == ("phase1", "phase2", "phase2-sac")
 
 
 @pytest.mark.parametrize("name", ["phase1", "phase2"])

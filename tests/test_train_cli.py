@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,11 @@ import tiny
 
 import koz_jax.trainer
 from koz_jax import storage
-from koz_jax.config import Settings, TrainConfig
+from koz_jax.config import TrainConfig
 from koz_jax.metrics_log import read_metrics
 from koz_jax.presets import PRESETS, preset
 from koz_jax.run_folder import RunFolder
+from koz_jax.settings import Settings
 
 
 @pytest.fixture
@@ -96,11 +98,12 @@ BAD = [
     ("--resume nowhere", ["resume: nowhere is not a run folder (it has no config.json)"]),
     ("--resume .", ["resume: . is not a run folder (it has no config.json)"]),
     ("--resume", ["--resume"]),
+    (f"--resume {'x' * 300}", ["resume: xxx", "is not a run folder"]),
     ("--start-from nowhere", ["start_from: nowhere is neither a run with a checkpoint nor a snapshot"]),
 ]
 
 
-@pytest.mark.parametrize(("argv", "words"), BAD, ids=[argv for argv, _ in BAD])
+@pytest.mark.parametrize(("argv", "words"), BAD, ids=[argv[:60] for argv, _ in BAD])
 @pytest.mark.usefixtures("no_training")
 def test_bad_input_is_refused_by_name_before_anything_happens(capsys, monkeypatch, empty_cwd, argv, words):
     monkeypatch.setattr(koz_jax.trainer, "_template", lambda *_: None)  # shapes are of no use here
@@ -198,6 +201,16 @@ def test_help_names_and_describes_every_setting(capsys):
         assert flag in flags
         assert re.sub(r"\s", "", description) in text, flag
     assert {"--run", "--resume", "--start-from", "--cases"} <= flags
+
+
+def test_help_cut_short_by_its_reader_ends_quietly():
+    with subprocess.Popen(
+        [sys.executable, tiny.ROOT / "train.py", "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 141
 
 
 def test_help_of_a_preset_shows_its_values(capsys):

@@ -11,20 +11,12 @@ import pytest
 from scipy import stats
 
 from koz_jax import curriculum, env, observation, task, trainer, training
-from koz_jax.config import (
-    CurriculumConfig,
-    NetworkConfig,
-    PhaseConfig,
-    RewardConfig,
-    SacConfig,
-    ScenarioConfig,
-    TaskConfig,
-    TrainConfig,
-    constant,
-)
+from koz_jax.config import CurriculumConfig, NetworkConfig, PhaseConfig, SacConfig, TrainConfig
 from koz_jax.presets import preset
 from koz_jax.sac import learner as sac_learner
 from koz_jax.sac import replay
+from koz_jax.settings import constant
+from koz_jax.task_config import RewardConfig, ScenarioConfig, TaskConfig
 
 # Everything small, and chosen so that within STEPS the ring wraps, episodes end and phase 2 begins.
 CONFIG = TrainConfig(

@@ -1,0 +1,51 @@
+"""What settings are made of: checked numbers, ramps, and the base class of all of them."""
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+PositiveFloat = Annotated[float, Field(gt=0)]
+NonNegativeFloat = Annotated[float, Field(ge=0)]
+# Counts are int32 on the device, and so are the bits of a seed.
+PositiveInt = Annotated[int, Field(gt=0, lt=2**31)]
+NonNegativeInt = Annotated[int, Field(ge=0, lt=2**31)]
+Seed = Annotated[int, Field(ge=0, lt=2**32)]
+Fraction = Annotated[float, Field(gt=0, le=1)]
+HalfAngleDeg = Annotated[float, Field(gt=0, lt=180)]
+DeviationDeg = Annotated[float, Field(ge=0, le=180)]
+Vector = tuple[float, float, float]
+
+
+def _check_ramp(ramp: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    fractions = [fraction for fraction, _ in ramp]
+    if not ramp or fractions != sorted(set(fractions)) or fractions[0] < 0 or fractions[-1] > 1:
+        raise ValueError("a ramp needs one or more (fraction, value) pairs with fractions rising strictly in [0, 1]")
+    return ramp
+
+
+def check_steps(name: str, seconds: float, step_seconds: float) -> None:
+    """Refuse a time [s] that holds no step, or more than can be counted."""
+    if not 0.5 < seconds / step_seconds < 2**31 - 1:
+        raise ValueError(f"{name} must hold 1 to 2^31 - 1 steps of step_seconds = {step_seconds}; got {seconds}")
+
+
+# Piecewise linear in the fraction of the phase that is done, constant before the first and after the last pair.
+Ramp = Annotated[tuple[tuple[float, float], ...], AfterValidator(_check_ramp)]
+
+
+def constant(value: float) -> Ramp:
+    """Make a ramp that stays at one value."""
+    return ((0.0, value),)
+
+
+def ramp_value(ramp: Ramp, fraction: float) -> float:
+    """Value of a ramp at a fraction of its phase."""
+    fractions, values = zip(*ramp, strict=True)
+    return float(np.interp(fraction, fractions, values))
+
+
+class Settings(BaseModel):
+    """Base of all settings: immutable, no unknown fields, no infinities."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
