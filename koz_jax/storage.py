@@ -41,6 +41,22 @@ def check_writable(name: str, path: Path) -> None:
         raise UserError(f"{name}: {path} cannot be written: {error.strerror or error}") from None
 
 
+def make_folder(name: str, path: Path) -> None:
+    """Make a folder for results, or refuse it before the work whose results it is for.
+
+    Raises:
+        UserError: it cannot be made or written to; the message begins with ``name``, the setting that gave the path.
+
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe = _temporary(path / "probe")
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise UserError(f"{name}: the folder {path} cannot be written: {error.strerror or error}") from None
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a file in one step: readers see the old content or the new, never a part."""
     fresh = _temporary(path)
