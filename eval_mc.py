@@ -41,6 +41,8 @@ class EvalArgs:
     """Write the results as JSON."""
     csv: Path | None = None
     """Write a row per case."""
+    figures: Path | None = None
+    """Draw the Monte Carlo figures into this folder, as PNG and PDF (needs the extra viz)."""
     replay_case: int | None = None
     """Fly only this case of the draw, and write its history."""
     history: Path | None = None
@@ -86,12 +88,21 @@ def _check_outputs(args: EvalArgs) -> None:
         for name, path in outputs.items():
             if path is not None:
                 raise UserError(f"{name}: is not written with --replay-case, which writes --history; got {path}")
+        if args.figures is not None:
+            raise UserError(
+                f"figures: are of many cases, and not drawn with --replay-case; got {args.figures}. One case is drawn"
+                f" by python fly.py --case {args.replay_case} --seed {args.seed}"
+            )
         if not 0 <= args.replay_case < args.cases:
             raise UserError(f"replay_case: must be from 0 to cases - 1 = {args.cases - 1}, got {args.replay_case}")
         outputs["history"] = _history_path(args)
     for name, path in outputs.items():
         if path is not None:
             storage.check_writable(name, path)
+    if args.figures is not None:
+        from koz_jax.figures import style  # noqa: F401  without matplotlib, say so before the flight
+
+        storage.make_folder("figures", args.figures)
 
 
 def _replay(agent: Agent, task: TaskConfig, config: MonteCarloConfig, case: int, path: Path) -> None:
@@ -115,6 +126,12 @@ def _monte_carlo(agent: Agent, task: TaskConfig, config: MonteCarloConfig, args:
         storage.write_json(args.json, evaluation.report(flown, summary))
     if args.csv:
         storage.write_text(args.csv, tables.cases_csv(flown.results))
+    if args.figures:
+        from koz_jax.figures import monte_carlo, style
+
+        title = f"{style.short_name(args.agent)}: {config.cases} random cases, seed {config.seed}"
+        for path in monte_carlo.write(args.figures, flown.results, task, title):
+            print(f"figure: {path}")
 
 
 if __name__ == "__main__":

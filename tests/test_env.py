@@ -203,26 +203,3 @@ def test_actions_beyond_the_limits_act_like_the_limits(setting, params):
     step = jax.jit(env.step)
     beyond, at = step(state, jnp.array([7.0, -3.0, 0.5]), params), step(state, jnp.array([1.0, -1.0, 0.5]), params)
     jax.tree.map(np.testing.assert_array_equal, beyond, at)
-
-
-def test_gradient_through_the_steps_agrees_with_finite_differences(setting):
-    """Of the final pointing error and margin with respect to one action of every sample."""
-
-    def final(scenario: Scenario, params: EnvParams, actions: jax.Array) -> jax.Array:
-        def advance(state: EnvState, action: jax.Array) -> tuple[EnvState, jax.Array]:
-            state, outcome = env.step(state, action, params)
-            return state, outcome.zone_margin
-
-        state, margins = jax.lax.scan(advance, env.reset(scenario), actions)
-        return state.angle + 0.3 * margins[-1]
-
-    with jax.enable_x64(True):
-        exact = jax.tree.map(lambda leaf: jnp.array(leaf, jnp.float64), (setting.scenario(), setting.params()))
-        actions = jnp.array(np.clip(setting.actions[:, :20], -0.9, 0.9))
-        value_and_gradient = jax.jit(jax.vmap(jax.value_and_grad(final, argnums=2)))
-        _, gradient = value_and_gradient(*exact, actions)
-        h = 1e-3
-        for axis in range(3):
-            above, below = (value_and_gradient(*exact, actions.at[:, 5, axis].add(d))[0] for d in (h, -h))
-            np.testing.assert_allclose(gradient[:, 5, axis], (above - below) / (2 * h), rtol=1e-5, atol=1e-10)
-            assert np.all(np.abs(gradient[:, 5, axis]) > 1e-6)

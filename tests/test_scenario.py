@@ -21,12 +21,16 @@ UNLIKELY = 1e-3
 BORESIGHT = jnp.array([1.0, 0.0, 0.0])
 
 
-@functools.partial(jax.jit, static_argnames=("rule", "max_draws"))
+@functools.partial(jax.jit, static_argnames=("rule", "max_draws", "keep_angle"))
 def _sample_batch(
-    ranges: ScenarioRanges, boresight: jax.Array, rule: scenario.InfeasibleRule, max_draws: int = 1000
+    ranges: ScenarioRanges,
+    boresight: jax.Array,
+    rule: scenario.InfeasibleRule,
+    max_draws: int = 1000,
+    keep_angle: bool = False,
 ) -> Scenario:
     keys = jax.random.split(jax.random.key(5), COUNT)
-    return jax.vmap(lambda key: scenario.sample(key, ranges, boresight, rule, max_draws))(keys)
+    return jax.vmap(lambda key: scenario.sample(key, ranges, boresight, rule, max_draws, keep_angle))(keys)
 
 
 def _draw(
@@ -35,8 +39,9 @@ def _draw(
     rule: scenario.InfeasibleRule,
     boresight: jax.Array = BORESIGHT,
     max_draws: int = 1000,
+    keep_angle: bool = False,
 ) -> Scenario:
-    drawn = _sample_batch(task.scenario_ranges(ScenarioConfig(), low, high), boresight, rule, max_draws)
+    drawn = _sample_batch(task.scenario_ranges(ScenarioConfig(), low, high), boresight, rule, max_draws, keep_angle)
     return jax.tree.map(np.asarray, drawn)
 
 
@@ -183,6 +188,19 @@ def test_resample_that_gives_up_still_keeps_the_separation_or_leaves_the_zone_ou
     assert np.all(room[zone] >= half_angle[zone] + 2.0 - 1e-4)
     assert np.all(half_angle[zone] >= 15.0 - 1e-4)
     assert np.all(room[~zone] < 17.0 + 1e-4)
+
+
+def test_resample_that_keeps_the_angle_leaves_the_deviations_as_the_range_says():
+    """Drawing them again favours large ones, also where no zone fits at all."""
+    drawn = _draw(20.0, 180.0, "resample", max_draws=8, keep_angle=True)
+    angle, half_angle, room = _angle_deg(drawn), _half_angle_deg(drawn), _room_deg(drawn)
+    assert stats.kstest(angle, stats.uniform(20.0, 160.0).cdf).pvalue > UNLIKELY
+    zone = half_angle > 0
+    assert np.all(room[zone] >= half_angle[zone] + 2.0 - 1e-4)
+    assert np.all(half_angle[zone] >= 15.0 - 1e-4)
+    # The boresight is at most half the deviation away from the axis half-way.
+    assert not np.any(zone[angle < 2 * 17.0 - 1e-3])
+    assert np.mean(zone[angle > 80.0]) > 0.99
 
 
 def test_shrink_leaves_the_zone_out_exactly_where_the_smallest_does_not_fit(shrunk):

@@ -1,0 +1,230 @@
+"""Learning curves of one or several runs: ``python -m koz_jax.figures.learning RUN [RUN ...] --out DIR``."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import tyro
+
+from koz_jax.errors import UserError, exit_status
+from koz_jax.summary import PAPER_TABLE
+
+if TYPE_CHECKING:
+    from koz_jax.figures.style import Axes, Figure
+
+# Share of the time axis that the refinement gets; its iterations are few, but each is a batch of whole maneuvers.
+_REFINEMENT_SHARE = 0.2
+
+
+@dataclasses.dataclass(frozen=True)
+class _Panel:
+    """One curve: its column, its axis, the factor to the axis' unit, and the paper's value in that unit."""
+
+    column: str
+    label: str
+    factor: float
+    paper: float
+    logarithmic: bool = False
+
+
+_PANELS = (
+    _Panel("eval/mean_reward", "mean reward [-]", 1.0, PAPER_TABLE.mean_reward),
+    _Panel("eval/success_rate", "success [%]", 100.0, 100.0 * PAPER_TABLE.success_rate),
+    _Panel("eval/violation_rate", "zone violated [%]", 100.0, 100.0 * PAPER_TABLE.violation_rate),
+    _Panel("eval/settling_time_mean", "settling time [s]", 1.0, PAPER_TABLE.settling_time_mean),
+    _Panel("eval/control_effort_mean", "control effort [N² m² s]", 1.0, PAPER_TABLE.control_effort_mean),
+    _Panel(
+        "eval/control_accuracy_deg_mean", "control accuracy [deg]", 1.0, PAPER_TABLE.control_accuracy_deg_mean, True
+    ),
+)
+
+_COLUMNS = ("updates", "curriculum/phase", "refine/cost", *(panel.column for panel in _PANELS))
+
+
+@dataclasses.dataclass(frozen=True)
+class LearningArgs:
+    """Draw the learning curves of runs: the evaluations on the way, median and spread over the runs."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of runs, for example of the same preset with several seeds."""
+    out: Path = Path("figures")
+    """Folder for learning.png and learning.pdf."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Stages:
+    """Where a run passes from one stage to the next, counted in updates and then iterations."""
+
+    phase1: int  # updates of phase 1
+    learned: int  # updates of both phases
+    length: int  # and iterations of refinement
+
+    def position(self, done: np.ndarray | float) -> np.ndarray:
+        """Place on the time axis, in [0, 1]; the refinement gets a fixed share of it."""
+        if not 0 < self.learned < self.length:
+            return np.asarray(done) / max(self.length, 1)
+        return np.asarray(np.interp(done, [0, self.learned, self.length], [0.0, 1.0 - _REFINEMENT_SHARE, 1.0]))
+
+
+@dataclasses.dataclass(frozen=True)
+class Curves:
+    """The evaluations of several runs at common instants; nan where a run has none."""
+
+    done: np.ndarray  # (instants,) updates, then iterations
+    values: dict[str, np.ndarray]  # by column: (runs, instants)
+    stages: Stages
+
+
+def read_metrics(run: Path) -> dict[str, np.ndarray]:
+    """Read the columns of a run's ``metrics.csv`` that are drawn.  Returns arrays (rows,), nan where a cell is empty.
+
+    Raises:
+        UserError: there is no such file, or it is not one that a training wrote.
+
+    """
+    path = run / "metrics.csv"
+    if not path.is_file():
+        raise UserError(f"runs: {run} is not a run folder (it has no metrics.csv)")
+    try:
+        # A training under way may not have finished its last line.
+        lines = path.read_bytes().decode("utf-8").rpartition("\n")[0]
+        rows = list(csv.DictReader(io.StringIO(lines), strict=True))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise UserError(f"{path}: cannot be read as CSV: {error}") from None
+    if not rows:
+        raise UserError(f"{path}: has no rows yet; the run has logged nothing")
+    missing = [name for name in _COLUMNS if name not in rows[0]]
+    if missing:
+        raise UserError(f"{path}: has no column {missing[0]!r}; it is not a training's log")
+    try:
+        return {name: np.array([float(row[name] or "nan") for row in rows]) for name in _COLUMNS}
+    except ValueError as error:
+        raise UserError(f"{path}: a cell is not a number: {error}") from None
+
+
+def stages(logs: list[dict[str, np.ndarray]]) -> Stages:
+    """Find the stages of the longest run, which stand for all."""
+
+    def last(log: dict[str, np.ndarray], rows: np.ndarray) -> int:
+        return int(np.max(log["updates"][rows], initial=0.0))
+
+    log = max(logs, key=lambda log: log["updates"].max())
+    learning, in_phase1 = np.isnan(log["refine/cost"]), log["curriculum/phase"] == 1
+    # The row at the end of phase 1 carries the curriculum of what comes next: phase 2.
+    ended = learning & ~in_phase1
+    if not in_phase1.any():
+        phase1 = 0
+    else:
+        phase1 = int(log["updates"][ended].min()) if ended.any() else last(log, learning)
+    return Stages(phase1, learned=last(log, learning), length=last(log, np.ones_like(learning)))
+
+
+def curves(logs: list[dict[str, np.ndarray]]) -> Curves:
+    """Bring the evaluations of several runs to common instants; between its own a run is interpolated."""
+    evaluated = [np.isfinite(log["eval/mean_reward"]) for log in logs]
+    done = np.unique(np.concatenate([log["updates"][rows] for log, rows in zip(logs, evaluated, strict=True)]))
+
+    def at_instants(log: dict[str, np.ndarray], column: str) -> np.ndarray:
+        known = np.isfinite(log[column])
+        if not known.any():
+            return np.full(len(done), np.nan)
+        return np.interp(done, log["updates"][known], log[column][known], left=np.nan, right=np.nan)
+
+    values = {panel.column: np.stack([at_instants(log, panel.column) for log in logs]) for panel in _PANELS}
+    return Curves(done, values, stages(logs))
+
+
+def draw(shown: Curves, title: str = "") -> Figure:
+    """Draw the curves: the median of the runs as a line, from the lowest to the highest as a band."""
+    from koz_jax.figures import style
+
+    with style.look():
+        figure = style.new_figure(9.6, 5.4)
+        panels = figure.subplots(2, 3, sharex=True).flat
+        for axes, panel in zip(panels, _PANELS, strict=True):
+            _draw_panel(axes, panel, shown)
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
+        figure.suptitle(title)
+    return figure
+
+
+def _draw_panel(axes: Axes, panel: _Panel, shown: Curves) -> None:
+    from koz_jax.figures import style
+
+    values = panel.factor * shown.values[panel.column]
+    known = np.isfinite(values).any(axis=0)
+    x, values = shown.stages.position(shown.done[known]), values[:, known]
+    runs = len(values)
+    if runs > 1:
+        low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
+        axes.fill_between(x, low, high, color=style.SKY, alpha=0.45, linewidth=0, label=f"lowest to highest of {runs}")
+    label = f"median of {runs} runs" if runs > 1 else "evaluation during training"
+    axes.plot(x, np.nanmedian(values, axis=0), color=style.BLUE, marker=".", markersize=4, label=label)
+    axes.axhline(
+        panel.paper, color=style.VERMILLION, linestyle="--", linewidth=1.0, label="paper's agent, 10,000 cases"
+    )
+    if panel.logarithmic:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+    axes.set_ylabel(panel.label)
+    _draw_stages(axes, shown.stages)
+
+
+def _draw_stages(axes: Axes, found: Stages) -> None:
+    """Separate and name the stages; ticks say where each ends."""
+    from koz_jax.figures import style
+
+    ends = {"phase 1": found.phase1, "phase 2": found.learned, "refine": found.length}
+    begin, ticks = 0, {0.0: "0"}
+    for name, end in ends.items():
+        if end <= begin:
+            continue
+        left, right = (float(found.position(at)) for at in (begin, end))
+        axes.text(0.5 * (left + right), 1.01, name, transform=axes.get_xaxis_transform(), ha="center", fontsize=7.5)
+        axes.axvline(right, color=style.GREY, linewidth=0.8, linestyle=":")
+        ticks[right] = _count(end) if name != "refine" else f"+{_count(end - begin)}"
+        begin = end
+    axes.set_xticks(list(ticks), list(ticks.values()))
+    axes.set_xlim(0.0, 1.02)
+    if axes.get_subplotspec().is_last_row():  # pyright: ignore[reportOptionalMemberAccess]
+        axes.set_xlabel("gradient updates, + refinement iterations")
+
+
+def _count(number: int) -> str:
+    """A count in few characters: 400, 40k, 2.5M."""
+    factor, unit = (1e6, "M") if number >= 1e6 else (1e3, "k") if number >= 1e3 else (1.0, "")
+    return f"{number / factor:.3g}{unit}"
+
+
+def main(argv: list[str]) -> int:
+    """Read and draw.  Returns the exit status."""
+    prog = "python -m koz_jax.figures.learning"
+    return exit_status(lambda: _draw_runs(tyro.cli(LearningArgs, args=argv, prog=prog)))
+
+
+def _draw_runs(args: LearningArgs) -> int:
+    from koz_jax import storage
+    from koz_jax.figures import style
+
+    if not args.runs:
+        raise UserError("runs: give the folder of one run or more")
+    logs = [read_metrics(run) for run in args.runs]
+    shown = curves(logs)
+    if not len(shown.done):
+        raise UserError(f"runs: no evaluation in {', '.join(map(str, args.runs))} yet")
+    storage.make_folder("out", args.out)
+    names = ", ".join(run.resolve().name for run in args.runs[:4]) + (", ..." if len(args.runs) > 4 else "")
+    for path in style.save(draw(shown, f"Learning curves: {names}"), args.out, "learning"):
+        print(f"figure: {path}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,95 @@
+"""How figures look, and how they are saved.  What draws imports matplotlib through this module."""
+
+import contextlib
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from koz_jax.errors import UserError
+
+try:
+    import matplotlib
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.backends.backend_agg import FigureCanvasAgg as FigureCanvasAgg
+    from matplotlib.figure import Figure as Figure
+    from matplotlib.lines import Line2D as Line2D
+except ImportError as error:
+    raise UserError(f'figures need matplotlib: pip install "koz_jax[viz]" ({error})') from None
+
+# Okabe & Ito's palette: told apart also by readers who do not see all colours.
+BLACK = "#000000"
+BLUE = "#0072B2"
+SKY = "#56B4E9"
+GREEN = "#009E73"
+ORANGE = "#E69F00"
+VERMILLION = "#D55E00"
+PURPLE = "#CC79A7"
+GREY = "#7F7F7F"
+
+# Three body axes, from dark to light, so that they differ also without colours.
+BODY_AXES = (BLUE, VERMILLION, ORANGE)
+
+PNG_DPI = 200
+RASTER_DPI = 300  # of point clouds inside a PDF
+
+_LOOK: dict[Any, Any] = {
+    "font.family": "DejaVu Sans",  # comes with matplotlib
+    "font.size": 9.0,
+    "axes.titlesize": 10.0,
+    "axes.labelsize": 9.0,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "legend.fontsize": 8.0,
+    "figure.titlesize": 10.5,
+    "axes.linewidth": 0.7,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.linewidth": 0.4,
+    "grid.color": "#D9D9D9",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "lines.linewidth": 1.2,
+    "lines.solid_capstyle": "round",  # closes a circle without a notch
+    "legend.frameon": False,
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+    "pdf.fonttype": 42,  # text stays text
+}
+
+
+@contextlib.contextmanager
+def look() -> Iterator[None]:
+    """Settings under which figures are made; ``@look()`` on what draws."""
+    with matplotlib.rc_context(_LOOK):
+        yield
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Make an empty figure without any window or global state.  width, height: [inch]."""
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+@look()
+def save(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Write a figure as PNG and PDF.  The same figure gives the same bytes.  Returns the files."""
+    picture, document = io.BytesIO(), io.BytesIO()
+    figure.savefig(picture, format="png", dpi=PNG_DPI, metadata={"Software": None})
+    figure.savefig(document, format="pdf", dpi=RASTER_DPI, metadata={"CreationDate": None})
+    contents = {folder / f"{name}.png": picture.getvalue(), folder / f"{name}.pdf": document.getvalue()}
+    for path, content in contents.items():
+        write_bytes(path, content)
+    return list(contents)
+
+
+def short_name(agent: str) -> str:
+    """Name of an agent for a title: a shipped one's own, or the last part of a folder."""
+    return Path(agent).resolve().name or agent
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file, or say why it cannot be written."""
+    try:
+        path.write_bytes(content)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror or error}") from error

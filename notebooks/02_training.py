@@ -1,0 +1,88 @@
+# %% [markdown]
+# # 2. Training
+#
+# A small network learns the maneuver in about a minute on two CPU cores: first turning (phase 1), then turning around
+# the zone (phase 2), then a polish by gradients through the dynamics. `python train.py` does the same with more of
+# everything.
+
+# %%
+import os
+from pathlib import Path
+
+import numpy as np
+from IPython.display import display
+
+from koz_jax import TrainConfig, fly_scenario, monte_carlo, preset, runtime, scenario, summarise, table, train
+from koz_jax.figures import learning, sphere
+
+runtime.configure()  # all cores; compiled programs are kept for the next time
+small = os.environ.get("KOZ_JAX_BUDGET") == "small"
+
+# %% [markdown]
+# ## Settings
+# A preset is a validated, immutable object. To change it, change its content and validate again.
+
+# %%
+fast = preset("fast")
+phase1, phase2 = fast.curriculum.phase1.model_dump(), fast.curriculum.phase2.model_dump()
+config = TrainConfig.model_validate(
+    fast.model_dump()
+    | {
+        "preset": "custom",
+        "network": {"hidden_sizes": (64, 64)},
+        "curriculum": {
+            "phase1": phase1 | {"updates": 4_000 if small else 24_000},
+            "phase2": phase2 | {"updates": 4_000 if small else 40_000},
+        },
+        "refine": fast.refine.model_dump() | {"iterations": 40 if small else 200},
+        "eval_every": 2_000 if small else 8_000,
+        "eval_cases": 200,
+        "log_every": 400 if small else 2_000,
+        "refine_log_every": 10,
+        "refine_eval_every": 20 if small else 50,
+    }
+)
+
+# A setting that makes no sense is named, before any computing.
+try:
+    TrainConfig.model_validate(config.model_dump() | {"eval_min_angle_deg": 170.0, "eval_max_angle_deg": 120.0})
+except ValueError as error:
+    print(error.errors()[0]["msg"])  # pyright: ignore[reportAttributeAccessIssue]
+
+# %% [markdown]
+# ## Train
+# The run folder keeps the settings, the curves, a checkpoint to go on from, and the best agent of each phase.
+
+# %%
+run = Path("runs", "notebook")
+agent = train(config, run, progress=False)
+assert agent is not None
+print(*sorted(str(path.relative_to(run)) for path in run.glob("*")), sep="\n")
+
+# %% [markdown]
+# ## Watch it learn
+# `metrics.csv` has a row per logged chunk. `python -m koz_jax.figures.learning RUN [RUN ...]` draws the same figure of
+# one or several runs.
+
+# %%
+picture = learning.draw(learning.curves([learning.read_metrics(run)]))
+picture.set_dpi(70)
+display(picture)
+
+# %% [markdown]
+# ## Evaluate
+
+# %%
+cases = 500 if small else 5_000
+flown = monte_carlo(agent, cases=cases)
+print(table(summarise(flown.results), cases, "this agent"))
+
+# %% [markdown]
+# And the paper's test scenario:
+
+# %%
+history, result = fly_scenario(agent, scenario.paper_test())
+print(f"settled: {bool(result.settled)}, smallest margin: {np.rad2deg(float(result.min_margin)):.2f}°")
+picture = sphere.draw(history, config.task, "the paper's test scenario")
+picture.set_dpi(70)
+display(picture)

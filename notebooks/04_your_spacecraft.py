@@ -1,0 +1,108 @@
+# %% [markdown]
+# # 4. Your spacecraft
+#
+# Another body, weaker actuators, a telescope that points elsewhere, larger zones: everything about the task is a
+# setting. This notebook makes a small satellite of its own, sees how the shipped agent fares on it, trains one for it,
+# and evaluates that.
+
+# %%
+import os
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from IPython.display import display
+
+from koz_jax import TrainConfig, fly_case, load_agent, monte_carlo, preset, runtime, summarise, table, train
+from koz_jax.figures import sphere
+from koz_jax.task_config import TaskConfig
+
+runtime.configure()  # all cores; compiled programs are kept for the next time
+small = os.environ.get("KOZ_JAX_BUDGET") == "small"
+plt.rcParams |= {"figure.figsize": (8, 3), "figure.dpi": 80, "axes.grid": True, "grid.alpha": 0.4}
+
+# %%
+mine = TaskConfig.model_validate(
+    {
+        "spacecraft": {
+            "inertia": ((7.0, 0.3, 0.0), (0.3, 4.0, 0.2), (0.0, 0.2, 6.0)),  # kg m^2
+            "torque_limit": 0.15,  # N m per axis
+            "boresight": (0.0, 0.6, 0.8),
+        },
+        "scenario": {"min_half_angle_deg": 20.0, "max_half_angle_deg": 35.0},
+    }
+)
+
+# %% [markdown]
+# What cannot be is refused, with the reason:
+
+# %%
+try:
+    TaskConfig.model_validate({"spacecraft": {"inertia": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 5.0))}})
+except ValueError as error:
+    print(error.errors()[0]["msg"])  # pyright: ignore[reportAttributeAccessIssue]
+
+# %% [markdown]
+# ## The shipped agent on it
+# It was trained for another body and another telescope:
+
+# %%
+cases = 500 if small else 2_000
+before = monte_carlo(load_agent("phase2"), cases=cases, task_config=mine)
+print(table(summarise(before.results), cases, "phase2 on my spacecraft"))
+
+# %% [markdown]
+# ## One of its own
+# The same settings as in notebook 2, with the new task.
+
+# %%
+fast = preset("fast")
+phase1, phase2 = fast.curriculum.phase1.model_dump(), fast.curriculum.phase2.model_dump()
+config = TrainConfig.model_validate(
+    fast.model_dump()
+    | {
+        "preset": "custom",
+        "task": mine.model_dump(),
+        "network": {"hidden_sizes": (64, 64)},
+        "curriculum": {
+            "phase1": phase1 | {"updates": 4_000 if small else 24_000},
+            "phase2": phase2 | {"updates": 4_000 if small else 40_000},
+        },
+        "refine": fast.refine.model_dump() | {"iterations": 40 if small else 400},
+        "eval_every": 4_000 if small else 8_000,
+        "eval_cases": 200,
+        "log_every": 2_000,
+        "refine_log_every": 20,
+        "refine_eval_every": 40 if small else 100,
+    }
+)
+agent = train(config, Path("runs", "my-spacecraft"), progress=False)
+assert agent is not None
+
+# %%
+after = monte_carlo(agent, cases=cases)
+print(table(summarise(after.results), cases, "my agent"))
+
+# %% [markdown]
+# The paper's column is for its own spacecraft, and only there for scale.
+
+# %%
+figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3), layout="constrained")
+for name, flown in {"phase2": before, "my agent": after}.items():
+    left.hist(np.rad2deg(flown.results.min_margin), bins=np.arange(-40, 41, 2), histtype="step", label=name)
+    right.hist(flown.results.settling_time, bins=np.arange(0, 101, 2.5), histtype="step", label=name)
+left.set(xlabel="smallest margin [°]", ylabel="cases")
+right.set(xlabel="settling time [s]")
+left.legend()
+right.legend()
+plt.show()
+
+# %%
+history, _ = fly_case(agent, 0, after.config)
+picture = sphere.draw(history, mine, "case 0, my agent")
+picture.set_dpi(70)
+display(picture)
+
+# %% [markdown]
+# `agent.save("my-agent")` keeps it as a folder; `load_agent("my-agent")`, `eval_mc.py --agent my-agent` and
+# `python -m koz_jax.replay --agent my-agent` take it from there.

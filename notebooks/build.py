@@ -1,0 +1,107 @@
+"""Execute the notebooks and write them as ``.ipynb``: ``python notebooks/build.py``.
+
+The ``.py`` files are the only sources (Jupytext's percent format).  ``KOZ_JAX_BUDGET=small`` makes them cheap, for CI.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import jupytext
+from nbclient import NotebookClient
+from nbclient.exceptions import CellExecutionError
+from nbformat import NotebookNode, validate, writes
+
+from koz_jax import storage
+from koz_jax.errors import UserError, exit_status
+
+HERE = Path(__file__).resolve().parent
+LARGEST_PICTURE = 100_000  # bytes, so that a code host shows the notebook and its history stays small
+LARGEST_TEXT = 10_000  # characters
+
+
+def main(argv: list[str]) -> int:
+    """Build all notebooks, or those that are named.  Returns the exit status."""
+    names = [source.stem for source in sorted(HERE.glob("[0-9]*.py"))]
+    parser = argparse.ArgumentParser(prog="notebooks/build.py", description=__doc__)
+    parser.add_argument("notebooks", nargs="*", metavar="NAME", help=f"by default all: {', '.join(names)}")
+    parser.add_argument("--out", type=Path, default=HERE, help="folder of the .ipynb files; by default this one")
+    args = parser.parse_args(argv)
+    return exit_status(lambda: _build(args.notebooks or names, names, args.out))
+
+
+def _build(chosen: list[str], names: list[str], out: Path) -> int:
+    for name in chosen:
+        if name not in names:
+            raise UserError(f"notebooks: unknown notebook {name!r}; allowed: {', '.join(names)}")
+    begin = time.perf_counter()
+    for name in chosen:
+        start = time.perf_counter()
+        notebook = execute(HERE / f"{name}.py")
+        storage.write_text(out / f"{name}.ipynb", writes(notebook) + "\n")
+        print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
+    print(f"{len(chosen)} notebooks in {time.perf_counter() - begin:.0f} s")
+    return 0
+
+
+def execute(source: Path) -> NotebookNode:
+    """Run a notebook from top to bottom in a fresh process, in an empty folder.
+
+    Raises:
+        UserError: a cell fails, or leaves too large an output.
+
+    """
+    notebook = jupytext.read(source)
+    notebook.metadata = NotebookNode(kernelspec=_KERNEL, language_info={"name": "python"})
+    # The kernel of this environment, whatever others the user has.
+    os.environ["JUPYTER_PREFER_ENV_PATH"] = "1"
+    with tempfile.TemporaryDirectory(prefix="koz_jax-notebook-") as folder:
+        client = NotebookClient(
+            notebook,
+            timeout=None,
+            kernel_name=_KERNEL["name"],
+            record_timing=False,
+            startup_timeout=300,
+            extra_arguments=["--IPKernelApp.log_level=ERROR"],
+            resources={"metadata": {"path": folder}},
+        )
+        try:
+            client.execute()
+        except (CellExecutionError, RuntimeError) as error:  # the latter where the kernel does not start, or dies
+            raise UserError(f"{source.name}: {error}") from None
+    for number, cell in enumerate(notebook.cells):
+        cell.id = f"{number:02d}"  # Jupytext's are random, and would change with every build
+        if cell.cell_type == "code":
+            cell.outputs = [_checked(output, source.name) for output in cell.outputs if _is_kept(output, source.name)]
+    validate(notebook)
+    return notebook
+
+
+_KERNEL = {"name": "python3", "display_name": "Python 3", "language": "python"}
+
+
+def _is_kept(output: Any, name: str) -> bool:
+    """Warnings and progress are for who builds, not for who reads."""
+    if output.output_type == "stream" and output.name == "stderr":
+        print(f"{name}: {output.text.strip()}", file=sys.stderr)
+        return False
+    return True
+
+
+def _checked(output: Any, name: str) -> Any:
+    picture = len(base64.b64decode(output.get("data", {}).get("image/png", "")))
+    text = len(str(output.get("text", "")))
+    if picture > LARGEST_PICTURE or text > LARGEST_TEXT:
+        raise UserError(f"{name}: an output is too large: a picture of {picture} bytes, a text of {text} characters")
+    return output
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
