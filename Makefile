@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 
-.PHONY: train evaluate test lint benchmark
+.PHONY: train evaluate test lint benchmark figures notebooks
 
 train: $(VENV)/.core
 	$(BIN)/python train.py $(ARGS)
@@ -22,6 +22,14 @@ lint: $(VENV)/.dev
 
 benchmark: $(VENV)/.core
 	$(BIN)/python benchmarks/speed.py $(ARGS)
+
+# The pictures in README.md.
+figures: $(VENV)/.dev
+	$(BIN)/python fly.py --agent phase1 --out docs/figures/phase1
+	$(BIN)/python fly.py --agent phase2 --out docs/figures/phase2 --gif
+
+notebooks: $(VENV)/.dev
+	$(BIN)/python notebooks/build.py
 
 $(VENV)/.core: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit("koz_jax needs Python 3.11 or later: set PYTHON" if sys.version_info < (3, 11) else 0)'
