@@ -6,6 +6,7 @@
 # everything.
 
 # %%
+# %matplotlib inline
 import os
 from pathlib import Path
 

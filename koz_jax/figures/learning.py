@@ -103,9 +103,12 @@ def read_metrics(run: Path) -> dict[str, np.ndarray]:
     if missing:
         raise UserError(f"{path}: has no column {missing[0]!r}; it is not a training's log")
     try:
-        return {name: np.array([float(row[name] or "nan") for row in rows]) for name in _COLUMNS}
+        columns = {name: np.array([float(row[name] or "nan") for row in rows]) for name in _COLUMNS}
     except ValueError as error:
         raise UserError(f"{path}: a cell is not a number: {error}") from None
+    if not np.isfinite(columns["updates"]).all():
+        raise UserError(f"{path}: has a row without its number of updates")
+    return columns
 
 
 def stages(logs: list[dict[str, np.ndarray]]) -> Stages:
