@@ -29,7 +29,7 @@ figures: $(VENV)/.dev
 	$(BIN)/python fly.py --agent phase2 --out docs/figures/phase2 --gif
 
 notebooks: $(VENV)/.dev
-	$(BIN)/python notebooks/build.py
+	$(BIN)/python notebooks/build.py $(ARGS)
 
 $(VENV)/.core: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit("koz_jax needs Python 3.11 or later: set PYTHON" if sys.version_info < (3, 11) else 0)'
