@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import tiny
 from matplotlib.collections import Collection
+from matplotlib.colors import to_hex
 from PIL import Image
 
 import koz_jax.agent
@@ -202,9 +203,7 @@ def test_cases_are_coloured_by_verdict():
     wanted = {SETTLED: settled & ~violated, VIOLATED: violated, NOT_SETTLED: ~settled & ~violated}
     figure = monte_carlo.draw_samples(shown)
     for axes, values in zip(figure.axes, (results.reward, shown.settling_time, results.control_effort), strict=True):
-        clouds = {
-            matplotlib.colors.to_hex(np.array(cloud.get_facecolor())[0]).upper(): cloud for cloud in axes.collections
-        }
+        clouds = {to_hex(np.array(cloud.get_facecolor())[0]).upper(): cloud for cloud in axes.collections}
         for verdict, cases in wanted.items():
             expected = np.stack([np.flatnonzero(cases), np.asarray(values)[cases]], axis=1)
             np.testing.assert_allclose(offsets(clouds[verdict.color]), expected)
@@ -226,9 +225,7 @@ def test_what_did_not_settle_is_drawn_at_200_s():
 def test_the_accuracy_of_settled_cases_stands_alone():
     shown = monte_carlo.points(outcomes(500), TaskConfig())
     everything, settled_only = monte_carlo.draw_accuracy(shown, 0.25).axes
-    counts = [
-        sum(len(np.array(cloud.get_offsets())) for cloud in axes.collections) for axes in (everything, settled_only)
-    ]
+    counts = [sum(map(len, map(offsets, axes.collections))) for axes in (everything, settled_only)]
     assert counts == [500, shown.settled.sum()]
 
 
@@ -319,6 +316,14 @@ def test_runs_with_other_instants_are_interpolated_but_not_extended(tmp_path):
     np.testing.assert_array_equal(shown.done, [5, 10, 15, 20, 25, 30, 40])
     np.testing.assert_allclose(
         shown.values["eval/success_rate"], [[np.nan, 1, 1.5, 2, 2.5, 3, 4], [1, 1.5, 2, 2.5, 3, np.nan, np.nan]]
+    )
+
+
+def test_runs_of_other_lengths_are_not_mixed(tmp_path, capsys):
+    runs = [log(tmp_path / "a"), log(tmp_path / "b", updates=(10, 20))]
+    assert learning.main([*map(str, runs), "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err == (
+        "error: runs: draw runs of one preset together; these learned for [20, 40] updates\n"
     )
 
 

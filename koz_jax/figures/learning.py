@@ -112,11 +112,19 @@ def read_metrics(run: Path) -> dict[str, np.ndarray]:
 
 
 def stages(logs: list[dict[str, np.ndarray]]) -> Stages:
-    """Find the stages of the longest run, which stand for all."""
+    """Find the stages of the longest run, which stand for all.
+
+    Raises:
+        UserError: the refinement of some begins where others still learn; one axis cannot show both.
+
+    """
 
     def last(log: dict[str, np.ndarray], rows: np.ndarray) -> int:
         return int(np.max(log["updates"][rows], initial=0.0))
 
+    begins = {last(log, np.isnan(log["refine/cost"])) for log in logs if np.isfinite(log["refine/cost"]).any()}
+    if len(begins) > 1:
+        raise UserError(f"runs: draw runs of one preset together; these learned for {sorted(begins)} updates")
     log = max(logs, key=lambda log: log["updates"].max())
     learning, in_phase1 = np.isnan(log["refine/cost"]), log["curriculum/phase"] == 1
     # The row at the end of phase 1 carries the curriculum of what comes next: phase 2.
