@@ -4,6 +4,7 @@
 # Ten thousand random maneuvers in one call, the paper's table beside ours, and a closer look at those that went wrong.
 
 # %%
+# %matplotlib inline
 from pathlib import Path
 
 import jax

@@ -23,7 +23,8 @@ from koz_jax import storage
 from koz_jax.errors import UserError, exit_status
 
 HERE = Path(__file__).resolve().parent
-LARGEST_PICTURE = 100_000  # bytes, so that a code host shows the notebook and its history stays small
+# Small enough for a code host to show; most pictures are below half of it.
+LARGEST_PICTURE = 200_000  # bytes
 LARGEST_TEXT = 10_000  # characters
 
 
@@ -55,7 +56,7 @@ def execute(source: Path) -> NotebookNode:
     """Run a notebook from top to bottom in a fresh process, in an empty folder.
 
     Raises:
-        UserError: a cell fails, or leaves too large an output.
+        UserError: a cell fails, or leaves too large an output or a figure without its picture.
 
     """
     notebook = jupytext.read(source)
@@ -96,7 +97,10 @@ def _is_kept(output: Any, name: str) -> bool:
 
 
 def _checked(output: Any, name: str) -> Any:
-    picture = len(base64.b64decode(output.get("data", {}).get("image/png", "")))
+    data = output.get("data", {})
+    if data.get("text/plain", "").startswith("<Figure") and "image/png" not in data:
+        raise UserError(f"{name}: a figure shows as {data['text/plain']}; begin the notebook with %matplotlib inline")
+    picture = len(base64.b64decode(data.get("image/png", "")))
     text = len(str(output.get("text", "")))
     if picture > LARGEST_PICTURE or text > LARGEST_TEXT:
         raise UserError(f"{name}: an output is too large: a picture of {picture} bytes, a text of {text} characters")
