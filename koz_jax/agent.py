@@ -12,6 +12,8 @@ from pydantic import Field, ValidationError
 
 from koz_jax import observation, storage, task
 from koz_jax.config import NetworkConfig
+from koz_jax.controllers.base import Memoryless
+from koz_jax.env import EnvParams, EnvState
 from koz_jax.errors import UserError, explain
 from koz_jax.sac.networks import Params, Policy
 from koz_jax.settings import Settings
@@ -22,18 +24,22 @@ ACTION_SIZE = 3
 
 def policy_network(config: NetworkConfig) -> Policy:
     """The policy's network for this task."""
-    return Policy(config.hidden_sizes, task.encoding(config.encoding), ACTION_SIZE)
+    return Policy(config.hidden_sizes, task.encoding(config.encoding, config.observed_zones), ACTION_SIZE)
 
 
-class PolicyController(struct.PyTreeNode):
-    """The deterministic policy as a controller (see ``rollout.Controller``)."""
+class PolicyController(Memoryless):
+    """The deterministic policy as a controller."""
 
     policy: Params
     network: NetworkConfig = struct.field(pytree_node=False)
 
     def act(self, observed: jax.Array) -> jax.Array:
-        """Action (..., 3) in [-1, 1] for an observation (..., 16)."""
+        """Action (..., 3) in [-1, 1] for an observation (..., 16), longer where it sees several zones."""
         return policy_network(self.network).apply(self.policy, observed).mode()  # pyright: ignore
+
+    def decide(self, state: EnvState, params: EnvParams, memory: None) -> tuple[jax.Array, None]:
+        """Action (3,) in [-1, 1] for the state, by its observation."""
+        return self.act(observation.observe(state, params, self.network.observed_zones)), memory
 
 
 class Provenance(Settings):
@@ -77,12 +83,14 @@ class Agent:
     def predict(self, observations: np.ndarray) -> np.ndarray:
         """Deterministic actions.
 
-        observations: (16,) or (batch, 16), in the order of ``observation.LAYOUT``.  Returns (3,) or (batch, 3) in
-        [-1, 1]; times the torque limit that is the torque in body axes.
+        observations: (16,) or (batch, 16), in the order of ``observation.layout``; 5 entries more for each further
+        zone that the agent sees.  Returns (3,) or (batch, 3) in [-1, 1]; times the torque limit that is the torque in
+        body axes.
         """
         observed = np.asarray(observations, np.float32)
-        if observed.ndim not in (1, 2) or observed.shape[-1] != observation.SIZE:
-            allowed = f"({observation.SIZE},) or (batch, {observation.SIZE})"
+        size = observation.size(self.controller.network.observed_zones)
+        if observed.ndim not in (1, 2) or observed.shape[-1] != size:
+            allowed = f"({size},) or (batch, {size})"
             raise UserError(f"observations: must have shape {allowed}, got {observed.shape}")
         return np.asarray(_act(self.controller, observed))
 
@@ -138,7 +146,7 @@ def load_agent(name: str | Path = "phase2") -> Agent:
         raise UserError(f"{folder / 'record.json'}: {explain(error)}") from None
     template = jax.eval_shape(
         functools.partial(policy_network(record.network).init, jax.random.key(0)),
-        jax.ShapeDtypeStruct((observation.SIZE,), np.float32),
+        jax.ShapeDtypeStruct((observation.size(record.network.observed_zones),), np.float32),
     )
     policy = storage.load_tree(folder, template)
     return Agent(PolicyController(policy, record.network), record.task, record.provenance, str(name))

@@ -20,6 +20,7 @@ from koz_jax.settings import (
     Ramp,
     Seed,
     Settings,
+    ZoneCount,
     check_steps,
     constant,
     ramp_value,
@@ -48,6 +49,8 @@ class NetworkConfig(Settings):
     """Units of each hidden layer (ReLU)."""
     encoding: EncodingConfig = EncodingConfig()
     """What the networks see besides the observation."""
+    observed_zones: ZoneCount = 1
+    """Zones in the observation, the nearest first."""
 
 
 class SacConfig(Settings):

@@ -16,6 +16,7 @@ class EnvParams(struct.PyTreeNode):
     spacecraft: Spacecraft
     reward: RewardParams
     dt: jax.Array  # () [s]
+    disturbance_B: jax.Array  # (3,) [N m] torque from outside; controllers do not know it
 
 
 class EnvState(struct.PyTreeNode):
@@ -39,6 +40,11 @@ def boresight_N(body: RigidBodyState, spacecraft: Spacecraft) -> jax.Array:
     return rotations.rotate(body.q_BN, spacecraft.boresight_B)
 
 
+def push(body: RigidBodyState, torque_B: jax.Array, params: EnvParams, dt: jax.Array) -> RigidBodyState:
+    """What a held torque (3,) [N m] makes of the body in a time dt () [s], disturbance included."""
+    return dynamics.step(body, torque_B + params.disturbance_B, params.spacecraft, dt)
+
+
 def reset(scenario: Scenario) -> EnvState:
     """The state in which a scenario starts."""
     state = EnvState(
@@ -60,7 +66,7 @@ def step(state: EnvState, action: jax.Array, params: EnvParams) -> tuple[EnvStat
     """
     torque_B = params.spacecraft.torque_limit * jnp.clip(action, -1.0, 1.0)
     next_state = state.replace(
-        body=dynamics.step(state.body, torque_B, params.spacecraft, params.dt),
+        body=push(state.body, torque_B, params, params.dt),
         q_e0_previous=attitude_error(state)[0],
         torque_B=torque_B,
         steps=state.steps + 1,

@@ -15,12 +15,13 @@ import numpy as np
 from flax import struct
 from jax.sharding import Mesh, PartitionSpec
 
-from koz_jax import rollout, scenario, task
-from koz_jax.agent import Agent
+from koz_jax import rollout, scenario, shield, task, uncertainty
+from koz_jax.controllers.base import Controller, Pilot
 from koz_jax.env import EnvParams
 from koz_jax.errors import UserError
-from koz_jax.rollout import CaseResult, Controller
+from koz_jax.rollout import CaseResult, Conditions
 from koz_jax.scenario import InfeasibleRule, Scenario, ScenarioRanges
+from koz_jax.shield_config import ShieldConfig, UncertaintyConfig
 from koz_jax.summary import Summary
 from koz_jax.task_config import TaskConfig
 
@@ -29,6 +30,9 @@ _CHUNK = 500
 
 # Separates the draws of the Monte Carlo from those of training with the same seed.
 _PURPOSE = 0x4D43
+
+# Separates what is random in flight from the draw of the cases.
+_IN_FLIGHT = 0x464C59
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +44,8 @@ class MonteCarloConfig:
     min_angle_deg: float = 80.0
     max_angle_deg: float = 180.0
     substeps: int = 1  # the zone is checked at so many instants per time step
+    shield: ShieldConfig | None = None  # None flies without
+    uncertainty: UncertaintyConfig | None = None  # None flies the model itself
 
     def __post_init__(self) -> None:
         _require(0 < self.cases < 2**31, "cases", self.cases, "from 1 to 2^31 - 1")
@@ -95,6 +101,10 @@ class _Draw(struct.PyTreeNode):
         """One case.  index: () int; boresight_B: (3,)."""
         return scenario.sample(jax.random.fold_in(self.key, index), self.ranges, boresight_B, self.rule)
 
+    def flight_key(self, index: jax.Array | int) -> jax.Array:
+        """Key of what is random while a case is flown.  index: () int."""
+        return jax.random.fold_in(jax.random.fold_in(self.key, _IN_FLIGHT), index)
+
 
 def _draw(task_config: TaskConfig, config: MonteCarloConfig) -> _Draw:
     return _Draw(
@@ -104,20 +114,52 @@ def _draw(task_config: TaskConfig, config: MonteCarloConfig) -> _Draw:
     )
 
 
+def conditions(task_config: TaskConfig, config: MonteCarloConfig) -> Conditions:
+    """Make the shield and the uncertainty that the settings ask for."""
+    params = task.env_params(task_config)
+    return Conditions(
+        shield=shield.for_spacecraft(config.shield, params.spacecraft, params.dt) if config.shield else None,
+        uncertainty=uncertainty.from_config(config.uncertainty) if config.uncertainty else None,
+    )
+
+
 def draw_case(task_config: TaskConfig, config: MonteCarloConfig, case: jax.Array | int) -> Scenario:
     """Draw the scenario of one case.  case: () int, its index."""
     return _draw(task_config, config).case(case, jnp.array(task_config.spacecraft.boresight))
 
 
-@functools.partial(jax.jit, static_argnames=("steps", "substeps", "mesh"))
-def _fly_cases(
-    controller: Controller, params: EnvParams, draw: _Draw, cases: jax.Array, *, steps: int, substeps: int, mesh: Mesh
-) -> CaseResult:
+class _Flight(struct.PyTreeNode):
+    """Who flies what under which conditions; traced but for the counts."""
+
+    controller: Controller
+    params: EnvParams
+    conditions: Conditions
+    steps: int = struct.field(pytree_node=False)
+    substeps: int = struct.field(pytree_node=False)
+
+    def judge(self, drawn: Scenario, key: jax.Array) -> CaseResult:
+        return rollout.run_case(self.controller, drawn, self.params, self.steps, self.substeps, self.conditions, key)
+
+    def keep(self, drawn: Scenario, key: jax.Array) -> rollout.History:
+        return rollout.fly(self.controller, drawn, self.params, self.steps, self.conditions, key)
+
+
+def _flight(controller: Controller, task_config: TaskConfig, config: MonteCarloConfig) -> _Flight:
+    return _Flight(
+        controller=controller,
+        params=task.env_params(task_config),
+        conditions=conditions(task_config, config),
+        steps=task_config.episode_steps,
+        substeps=config.substeps,
+    )
+
+
+@functools.partial(jax.jit, static_argnames="mesh")
+def _fly_cases(flight: _Flight, draw: _Draw, cases: jax.Array, *, mesh: Mesh) -> CaseResult:
     """cases: (devices * n,) int32 indices.  Returns leaves of the same length."""
 
     def one(case: jax.Array) -> CaseResult:
-        drawn = draw.case(case, params.spacecraft.boresight_B)
-        return rollout.run_case(controller, drawn, params, steps, substeps)
+        return flight.judge(draw.case(case, flight.params.spacecraft.boresight_B), draw.flight_key(case))
 
     def on_one_device(cases: jax.Array) -> CaseResult:
         return jax.lax.map(one, cases, batch_size=_CHUNK)
@@ -129,20 +171,18 @@ def _fly_cases(
 
 def _arguments(
     controller: Controller, task_config: TaskConfig, config: MonteCarloConfig
-) -> tuple[tuple[Controller, EnvParams, _Draw, jax.Array], dict[str, Any]]:
+) -> tuple[tuple[_Flight, _Draw, jax.Array], dict[str, Any]]:
     """Traced and static arguments of ``_fly_cases``."""
     check_feasible(task_config, config.max_angle_deg)
     devices = jax.local_devices()[: config.cases]
     # Every device flies equally many cases; the surplus is flown and dropped.
     padded = -(-config.cases // len(devices)) * len(devices)
     traced = (
-        controller,
-        task.env_params(task_config),
+        _flight(controller, task_config, config),
         _draw(task_config, config),
         jnp.arange(padded, dtype=jnp.int32),
     )
-    mesh = Mesh(np.array(devices), ("cases",))
-    return traced, {"steps": task_config.episode_steps, "substeps": config.substeps, "mesh": mesh}
+    return traced, {"mesh": Mesh(np.array(devices), ("cases",))}
 
 
 def _to_host(results: CaseResult, cases: int) -> CaseResult:
@@ -155,7 +195,7 @@ def fly_cases(controller: Controller, task_config: TaskConfig, config: MonteCarl
     return _to_host(_fly_cases(*traced, **static), config.cases)
 
 
-def run_cases(agent: Agent, task_config: TaskConfig, config: MonteCarloConfig) -> MonteCarlo:
+def run_cases(agent: Pilot, task_config: TaskConfig, config: MonteCarloConfig) -> MonteCarlo:
     """``fly_cases`` for an agent, with compilation and flight timed apart."""
     traced, static = _arguments(agent.controller, task_config, config)
     start = time.perf_counter()
@@ -181,37 +221,42 @@ def report(flown: MonteCarlo, summary: Summary) -> dict[str, float | int | str |
 
 
 def monte_carlo(
-    agent: Agent, cases: int = 10_000, seed: int = 0, task_config: TaskConfig | None = None, **options: float
+    agent: Pilot, cases: int = 10_000, seed: int = 0, task_config: TaskConfig | None = None, **options: Any
 ) -> MonteCarlo:
     """Fly an agent over ``cases`` random cases of the task it was trained for (or of another one).
 
     options: further fields of ``MonteCarloConfig``.
     """
-    config = MonteCarloConfig(cases=cases, seed=seed, **options)  # pyright: ignore[reportArgumentType]
+    config = MonteCarloConfig(cases=cases, seed=seed, **options)
     return run_cases(agent, task_config or agent.task, config)
 
 
 def fly_case(
-    agent: Agent, case: int, config: MonteCarloConfig, task_config: TaskConfig | None = None
+    agent: Pilot, case: int, config: MonteCarloConfig, task_config: TaskConfig | None = None
 ) -> tuple[rollout.History, CaseResult]:
     """Fly one case of the draw again and keep its history."""
     _require(0 <= case < config.cases, "case", case, f"from 0 to cases - 1 = {config.cases - 1}")
     flown = task_config or agent.task
     check_feasible(flown, config.max_angle_deg)
-    return fly_scenario(agent, draw_case(flown, config, jnp.int32(case)), flown, config.substeps)
+    return fly_scenario(agent, draw_case(flown, config, jnp.int32(case)), flown, config, case)
 
 
 def fly_scenario(
-    agent: Agent, drawn: Scenario, task_config: TaskConfig | None = None, substeps: int = 1
+    agent: Pilot,
+    drawn: Scenario,
+    task_config: TaskConfig | None = None,
+    config: MonteCarloConfig | None = None,
+    case: int = 0,
 ) -> tuple[rollout.History, CaseResult]:
-    """Fly one scenario, and keep its history and its judgement."""
-    flown = task_config or agent.task
-    return _fly_and_judge(agent.controller, drawn, task.env_params(flown), flown.episode_steps, substeps)
+    """Fly one scenario, and keep its history and its judgement.
+
+    config: how it is flown and checked; its draw is not used.  case: index of the case whose random numbers are used.
+    """
+    flown, how = task_config or agent.task, config or MonteCarloConfig()
+    key = _draw(flown, how).flight_key(case)
+    return _keep_and_judge(_flight(agent.controller, flown, how), drawn, key)
 
 
-@functools.partial(jax.jit, static_argnames=("steps", "substeps"))
-def _fly_and_judge(
-    controller: Controller, drawn: Scenario, params: EnvParams, steps: int, substeps: int
-) -> tuple[rollout.History, CaseResult]:
-    history = rollout.fly(controller, drawn, params, steps)
-    return history, rollout.run_case(controller, drawn, params, steps, substeps)
+@jax.jit
+def _keep_and_judge(flight: _Flight, drawn: Scenario, key: jax.Array) -> tuple[rollout.History, CaseResult]:
+    return flight.keep(drawn, key), flight.judge(drawn, key)

@@ -27,6 +27,13 @@ def margin(direction_N: jax.Array, zone: KeepOutZone) -> jax.Array:
     return angle_to_axis(direction_N, zone) - zone.half_angle
 
 
+def no_zones(count: int) -> KeepOutZone:
+    """A stack of absent zones.  Returns leaves (count, ...)."""
+    return KeepOutZone(
+        axis_N=jnp.tile(jnp.array([1.0, 0.0, 0.0]), (count, 1)), half_angle=jnp.full(count, NO_ZONE_HALF_ANGLE)
+    )
+
+
 def smallest_margin(direction_N: jax.Array, zones: KeepOutZone) -> jax.Array:
     """Margin to the nearest of several zones (stacked along a leading axis).  direction_N: (3,).  Returns () [rad]."""
     return jnp.min(jax.vmap(margin, in_axes=(None, 0))(direction_N, zones))

@@ -1,45 +1,109 @@
-"""The observation (Eq. 6 of the paper), declared once: sizes, slices and plots derive from ``LAYOUT``."""
+"""The observation (Eq. 6 of the paper), declared once: sizes, slices and plots derive from ``layout``.
 
+The paper has one zone, whose entries are the first 16.  Where there are several, the nearest comes first, and a
+policy that was trained for n zones sees the n nearest: the paper's 16 entries, then five for each zone after the first.
+"""
+
+import functools
 import itertools
+from collections.abc import Mapping
+from types import MappingProxyType
 
 import jax
 import jax.numpy as jnp
 
 from koz_jax import env, keep_out, rotations
 from koz_jax.env import EnvParams, EnvState
+from koz_jax.keep_out import KeepOutZone
 
-LAYOUT = {
-    "q_e": 4,  # attitude relative to the target
-    "omega_BN_B": 3,  # [rad/s]
-    "boresight_B": 3,  # unit vector
+_ZONE = {
     "zone_margin": 1,  # [rad] theta_margin
     "zone_angle": 1,  # [rad] theta
     "zone_direction_B": 3,  # unit vector from the boresight towards the zone's axis
-    "q_e0_previous": 1,  # scalar part of q_e one step ago
-}
-SIZE = sum(LAYOUT.values())
-SLICES = {
-    name: slice(end - size, end)
-    for (name, size), end in zip(LAYOUT.items(), itertools.accumulate(LAYOUT.values()), strict=True)
 }
 
 
-def observe(state: EnvState, params: EnvParams) -> jax.Array:
-    """What the controller sees.  Returns (16,), in the order of ``LAYOUT``."""
+@functools.cache
+def layout(zones: int = 1) -> Mapping[str, int]:
+    """Names and sizes of the parts, in order, for a policy that sees so many zones."""
+    first = {
+        "q_e": 4,  # attitude relative to the target
+        "omega_BN_B": 3,  # [rad/s]
+        "boresight_B": 3,  # unit vector
+        **_ZONE,
+        "q_e0_previous": 1,  # scalar part of q_e one step ago
+    }
+    further = {_zone_part(number, name): size for number in range(1, zones) for name, size in _ZONE.items()}
+    return MappingProxyType(first | further)
+
+
+def _zone_part(number: int, name: str) -> str:
+    return f"{number + 1}_{name}" if number else name
+
+
+def size(zones: int = 1) -> int:
+    """Entries of the observation."""
+    return sum(layout(zones).values())
+
+
+@functools.cache
+def slices(zones: int = 1) -> Mapping[str, slice]:
+    """Where each part is."""
+    parts = layout(zones)
+    ends = itertools.accumulate(parts.values())
+    return MappingProxyType({name: slice(end - parts[name], end) for name, end in zip(parts, ends, strict=True)})
+
+
+# The paper's observation.
+LAYOUT = layout()
+SIZE = size()
+SLICES = slices()
+
+
+def observe(state: EnvState, params: EnvParams, zones: int = 1) -> jax.Array:
+    """What the controller sees.  Returns (16 + 5 (zones - 1),), in the order of ``layout(zones)``.
+
+    A zone after the first that is absent reads margin pi, angle pi and direction zero.
+    """
+    parts = {
+        "q_e": env.attitude_error(state),
+        "omega_BN_B": state.body.omega_BN_B,
+        "boresight_B": params.spacecraft.boresight_B,
+        "q_e0_previous": state.q_e0_previous[None],
+    }
+    nearest = _nearest(state, params, zones)
+    for number in range(zones):
+        seen = _zone_parts(state, params, jax.tree.map(lambda leaf, i=number: leaf[i], nearest), masked=number > 0)
+        parts |= {_zone_part(number, name): value for name, value in seen.items()}
+    return jnp.concatenate([parts[name] for name in layout(zones)])
+
+
+def _nearest(state: EnvState, params: EnvParams, count: int) -> KeepOutZone:
+    """The zones with the smallest margins, nearest first, filled up with absent ones.  Returns leaves (count, ...)."""
+    zones = state.scenario.zones
+    present = zones.half_angle.shape[0]
+    if present > 1:
+        margins = jax.vmap(keep_out.margin, in_axes=(None, 0))(env.boresight_N(state.body, params.spacecraft), zones)
+        order = jnp.argsort(margins)[:count]
+        zones = jax.tree.map(lambda leaf: leaf[order], zones)
+    if count > present:
+        zones = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), zones, keep_out.no_zones(count - present))
+    return zones
+
+
+def _zone_parts(state: EnvState, params: EnvParams, zone: KeepOutZone, masked: bool) -> dict[str, jax.Array]:
     boresight_B = params.spacecraft.boresight_B
-    zone = jax.tree.map(lambda leaf: leaf[0], state.scenario.zones)
     axis_B = rotations.rotate(rotations.conjugate(state.body.q_BN), zone.axis_N)
     offset = axis_B - boresight_B
     distance = rotations.norm(offset)
     angle = keep_out.angle_to_axis(env.boresight_N(state.body, params.spacecraft), zone)
     parts = {
-        "q_e": env.attitude_error(state),
-        "omega_BN_B": state.body.omega_BN_B,
-        "boresight_B": boresight_B,
         "zone_margin": (angle - zone.half_angle)[None],
         "zone_angle": angle[None],
         # The direction is undefined where the two coincide; zero is finite and points nowhere.
         "zone_direction_B": offset / jnp.where(distance > 0.0, distance, 1.0),
-        "q_e0_previous": state.q_e0_previous[None],
     }
-    return jnp.concatenate([parts[name] for name in LAYOUT])
+    if not masked:
+        return parts
+    absent = {"zone_margin": jnp.pi, "zone_angle": jnp.pi, "zone_direction_B": 0.0}
+    return {name: jnp.where(zone.half_angle > 0.0, value, absent[name]) for name, value in parts.items()}

@@ -80,7 +80,7 @@ def maneuver_cost(controller: PolicyController, key: jax.Array, config: TrainCon
     drawn = scenario.sample(key, ranges, boresight_B, rule, MAX_DRAWS, keep_angle=True)
 
     def advance(state: EnvState, _: None) -> tuple[EnvState, jax.Array]:
-        action = controller.act(observation.observe(state, params))
+        action = controller.act(observation.observe(state, params, config.network.observed_zones))
         state, outcome = env.step(state, action, params)
         return state, step_cost(outcome, params, config.refine)
 

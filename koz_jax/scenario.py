@@ -2,6 +2,9 @@
 
 The zone sits where the boresight would be half-way along the shortest (eigen-axis) rotation from start to target.
 A draw is *feasible* when start and target both lie outside the zone by at least ``separation``.
+
+Further zones, which the paper does not have, lie around the first one: as far from start and target, and with a gap to
+each other, so that a way around them is always left (what remains of the sphere is connected).
 """
 
 from typing import Literal
@@ -10,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from koz_jax import rotations
+from koz_jax import keep_out, rotations
 from koz_jax.dynamics import RigidBodyState
 from koz_jax.keep_out import NO_ZONE_HALF_ANGLE, KeepOutZone
 
@@ -26,7 +29,10 @@ class ScenarioRanges(struct.PyTreeNode):
     max_rate: jax.Array  # () [rad/s] each component of the initial rate is uniform in [-max_rate, max_rate]
     min_half_angle: jax.Array  # () [rad]
     max_half_angle: jax.Array  # () [rad]
-    separation: jax.Array  # () [rad] between the zone's edge and the boresight at start and target
+    separation: jax.Array  # () [rad] between a zone's edge and the boresight at start and target
+    zone_gap: jax.Array  # () [rad] least gap between the edges of two zones
+    min_zones: jax.Array  # () int32, least number of zones
+    max_zones: int = struct.field(pytree_node=False)  # largest number of zones, and length of their stack
 
 
 class Scenario(struct.PyTreeNode):
@@ -118,12 +124,52 @@ def sample(
         half_angle = jnp.where(
             _is_feasible(draw, ranges), _full_half_angle(draw, ranges), _shrunk_half_angle(draw, ranges)
         )
-    zone = KeepOutZone(axis_N=draw.zone_axis_D, half_angle=half_angle)
+    zones = KeepOutZone(axis_N=draw.zone_axis_D[None], half_angle=half_angle[None])
+    if ranges.max_zones > 1:
+        looks_D = jnp.stack([boresight_B, rotations.rotate(draw.q_e, boresight_B)])
+        zones = _add_zones(jax.random.fold_in(key, _FURTHER), ranges, looks_D, zones)
     return Scenario(
         initial=RigidBodyState(draw.q_e, draw.omega_BN_B),
         q_DN=jnp.array([1.0, 0.0, 0.0, 0.0]),
-        zones=jax.tree.map(lambda leaf: leaf[None], zone),
+        zones=zones,
     )
+
+
+# Separates the draws of further zones from those of a case with one.
+_FURTHER = 0x5A4F4E45
+
+# Places that are tried for a further zone.
+_PLACES = 32
+
+
+def _add_zones(key: jax.Array, ranges: ScenarioRanges, looks_D: jax.Array, first: KeepOutZone) -> KeepOutZone:
+    """Put further zones within 90 deg of the first, as many as are drawn and as find a place.
+
+    looks_D: (2, 3) boresight at target and start; first: leaves (1, ...).  Returns leaves (max_zones, ...).
+    """
+    key_number, *keys = jax.random.split(key, ranges.max_zones)
+    number = jax.random.randint(key_number, (), ranges.min_zones, ranges.max_zones + 1)
+    zones = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), first, keep_out.no_zones(ranges.max_zones - 1))
+    to_all = jax.vmap(rotations.angle_between, in_axes=(None, 0))
+
+    for i, key_zone in enumerate(keys, start=1):
+        key_axis, key_size = jax.random.split(key_zone)
+        size = jax.random.uniform(key_size)
+        half_angle = ranges.min_half_angle + (ranges.max_half_angle - ranges.min_half_angle) * size
+        axes = jax.vmap(rotations.normalize)(jax.random.normal(key_axis, (_PLACES, 3)))
+        # Mirrored into the half of the sphere around the first zone.
+        axes = axes * jnp.where(axes @ first.axis_N[0] < 0.0, -1.0, 1.0)[:, None]
+        clear = jax.vmap(to_all, in_axes=(0, None))(axes, looks_D) >= half_angle + ranges.separation
+        room = half_angle + zones.half_angle + ranges.zone_gap
+        apart = jax.vmap(to_all, in_axes=(0, None))(axes, zones.axis_N) >= room
+        fits = jnp.all(clear, axis=1) & jnp.all(apart, axis=1)
+        place = jnp.argmax(fits)
+        wanted = (i < number) & fits[place]
+        zones = KeepOutZone(
+            axis_N=zones.axis_N.at[i].set(jnp.where(wanted, axes[place], zones.axis_N[i])),
+            half_angle=zones.half_angle.at[i].set(jnp.where(wanted, half_angle, keep_out.NO_ZONE_HALF_ANGLE)),
+        )
+    return zones
 
 
 def paper_test() -> Scenario:

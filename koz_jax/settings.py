@@ -5,6 +5,9 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+# More cones of 15 to 30 deg, with gaps, hardly find room on half a sphere.
+MAX_ZONES = 8
+
 PositiveFloat = Annotated[float, Field(gt=0)]
 NonNegativeFloat = Annotated[float, Field(ge=0)]
 # Counts are int32 on the device, and so are the bits of a seed.
@@ -12,8 +15,10 @@ PositiveInt = Annotated[int, Field(gt=0, lt=2**31)]
 NonNegativeInt = Annotated[int, Field(ge=0, lt=2**31)]
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Fraction = Annotated[float, Field(gt=0, le=1)]
+ShareBelowOne = Annotated[float, Field(ge=0, lt=1)]
 HalfAngleDeg = Annotated[float, Field(gt=0, lt=180)]
 DeviationDeg = Annotated[float, Field(ge=0, le=180)]
+ZoneCount = Annotated[int, Field(gt=0, le=MAX_ZONES)]
 Vector = tuple[float, float, float]
 
 

@@ -13,7 +13,8 @@ from koz_jax.rollout import CaseResult
 class Summary:
     """The rows of Table 4; field names are the keys of the JSON results.
 
-    Rates are shares in [0, 1].  Settling time, effort and accuracy are over the settled cases, nan if there is none.
+    Rates are shares in [0, 1], of all cases but for interventions, which are of all steps.  Settling time, effort and
+    accuracy are over the settled cases, nan if there is none.
     """
 
     mean_reward: float
@@ -27,6 +28,10 @@ class Summary:
     non_settled_rate: float
     violation_rate: float
     success_rate: float
+    min_margin_deg: float = math.nan
+    intervention_rate: float = 0.0
+    mean_torque_change: float = 0.0
+    deadlock_rate: float = 0.0
 
 
 PAPER_TABLE = Summary(
@@ -68,6 +73,10 @@ def summarise(results: CaseResult) -> Summary:
         non_settled_rate=float(np.mean(~settled)),
         violation_rate=float(np.mean(results.violated)),
         success_rate=float(np.mean(results.success)),
+        min_margin_deg=float(np.rad2deg(np.min(results.min_margin))),
+        intervention_rate=float(np.mean(results.intervention_rate)),
+        mean_torque_change=float(np.mean(results.mean_torque_change)),
+        deadlock_rate=float(np.mean(results.deadlocked)),
     )
 
 

@@ -35,6 +35,7 @@ def env_params(task: TaskConfig) -> EnvParams:
             progress_tolerance=jnp.deg2rad(jnp.float32(reward.progress_tolerance_deg)),
         ),
         dt=jnp.float32(task.step_seconds),
+        disturbance_B=jnp.zeros(3),
     )
 
 
@@ -48,15 +49,16 @@ def scenario_ranges(scenario: ScenarioConfig, min_angle_deg: float, max_angle_de
         min_half_angle=jnp.deg2rad(jnp.float32(scenario.min_half_angle_deg)),
         max_half_angle=jnp.deg2rad(jnp.float32(scenario.max_half_angle_deg)),
         separation=jnp.deg2rad(jnp.float32(scenario.separation_deg)),
+        zone_gap=jnp.deg2rad(jnp.float32(scenario.zone_gap_deg)),
+        min_zones=jnp.int32(scenario.min_zones),
+        max_zones=scenario.max_zones,
     )
 
 
-def encoding(config: EncodingConfig) -> Encoding:
-    """Which slices of the observation the networks also see at finer scales."""
-    q_vec = slice(observation.SLICES["q_e"].start + 1, observation.SLICES["q_e"].stop)
-    parts = (
-        (q_vec, config.attitude_scales),
-        (observation.SLICES["omega_BN_B"], config.rate_scales),
-        (observation.SLICES["zone_margin"], config.zone_margin_scales),
-    )
+def encoding(config: EncodingConfig, zones: int = 1) -> Encoding:
+    """Which slices of the observation (of so many zones) the networks also see at finer scales."""
+    slices = observation.slices(zones)
+    q_vec = slice(slices["q_e"].start + 1, slices["q_e"].stop)
+    parts = [(q_vec, config.attitude_scales), (slices["omega_BN_B"], config.rate_scales)]
+    parts += [(slices[name], config.zone_margin_scales) for name in slices if name.endswith("zone_margin")]
     return tuple((part.start, part.stop, scale) for part, scales in parts for scale in scales)

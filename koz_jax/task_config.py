@@ -7,7 +7,7 @@ from typing import Literal, Self
 import numpy as np
 from pydantic import model_validator
 
-from koz_jax.settings import HalfAngleDeg, NonNegativeFloat, PositiveFloat, Settings, Vector, check_steps
+from koz_jax.settings import HalfAngleDeg, NonNegativeFloat, PositiveFloat, Settings, Vector, ZoneCount, check_steps
 
 
 class SpacecraftConfig(Settings):
@@ -75,9 +75,17 @@ class ScenarioConfig(Settings):
     """Least angle between the zone's edge and the boresight at start and at target [deg]."""
     infeasible_zone: Literal["resample", "shrink"] = "resample"
     """Where the zone would hold start or target: draw the case again, or make the zone smaller."""
+    min_zones: ZoneCount = 1
+    """Least number of zones of a case."""
+    max_zones: ZoneCount = 1
+    """Largest number of zones of a case: the first on the direct way, the others around it."""
+    zone_gap_deg: NonNegativeFloat = 10.0
+    """Least gap between the edges of two zones [deg]."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
+        if self.min_zones > self.max_zones:
+            raise ValueError(f"min_zones must be at most max_zones; got {self.min_zones} and {self.max_zones}")
         if self.min_half_angle_deg > self.max_half_angle_deg:
             raise ValueError(
                 f"min_half_angle_deg must be at most max_half_angle_deg; got {self.min_half_angle_deg} and"
@@ -108,14 +116,22 @@ class TaskConfig(Settings):
         return round(self.episode_seconds / self.step_seconds)
 
     def with_rules(
-        self, angle_convention: Literal["full", "half"] | None, infeasible_zone: Literal["resample", "shrink"] | None
+        self,
+        angle_convention: Literal["full", "half"] | None = None,
+        infeasible_zone: Literal["resample", "shrink"] | None = None,
+        zones: int | None = None,
     ) -> TaskConfig:
-        """Judge the same task by another angle convention, or draw it by another rule; None keeps what is set."""
+        """Judge the same task by another angle convention, or draw it by another rule; None keeps what is set.
+
+        zones: number of zones of every case.
+        """
         changed = self.model_dump()
         if angle_convention is not None:
             changed["angle_convention"] = angle_convention
         if infeasible_zone is not None:
             changed["scenario"]["infeasible_zone"] = infeasible_zone
+        if zones is not None:
+            changed["scenario"] |= {"min_zones": zones, "max_zones": zones}
         return TaskConfig.model_validate(changed)
 
     @model_validator(mode="after")

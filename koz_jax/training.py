@@ -1,6 +1,7 @@
 """The training state and its one jitted transition: collect, sample, reward under the curriculum, learn."""
 
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -47,8 +48,8 @@ def make_sac(config: TrainConfig) -> Sac:
     """The learner's static settings."""
     return Sac(
         hidden_sizes=config.network.hidden_sizes,
-        encoding=task.encoding(config.network.encoding),
-        observation_size=observation.SIZE,
+        encoding=task.encoding(config.network.encoding, config.network.observed_zones),
+        observation_size=observation.size(config.network.observed_zones),
         action_size=ACTION_SIZE,
         target_entropy=config.sac.target_entropy,
         soft_update=config.sac.soft_update,
@@ -78,20 +79,25 @@ def _reset_envs(config: TrainConfig, params: EnvParams, at: Difficulty, key: jax
     return jax.vmap(fresh)(jax.random.split(key, config.num_envs))
 
 
+def _observer(config: TrainConfig, params: EnvParams) -> Callable[[EnvState], jax.Array]:
+    """Observations (environments, entries) of all environments."""
+    return jax.vmap(lambda state: observation.observe(state, params, config.network.observed_zones))
+
+
 def _advance(
     config: TrainConfig, params: EnvParams, states: EnvState, action: jax.Array, at: Difficulty, key: jax.Array
 ) -> tuple[EnvState, Transition]:
     """One step of all environments; those at the end of their episode start a new scenario."""
-    observe = jax.vmap(observation.observe, in_axes=(0, None))
+    observe = _observer(config, params)
     next_states, outcome = jax.vmap(env.step, in_axes=(0, 0, None))(states, action, params)
     truncated = next_states.steps >= config.training_episode_steps
     transition = Transition(
-        observation=observe(states, params),
+        observation=observe(states),
         action=action,
         outcome=outcome,
         terminated=jnp.zeros_like(truncated),
         truncated=truncated,
-        next_observation=observe(next_states, params),
+        next_observation=observe(next_states),
     )
 
     def restart() -> EnvState:
@@ -162,7 +168,7 @@ def train_step(config: TrainConfig, params: EnvParams, state: TrainState) -> tup
     at = curriculum.difficulty(config.curriculum, state.updates)
     key, key_action, key_reset, key_batch, key_updates = jax.random.split(state.key, 5)
 
-    observed = jax.vmap(observation.observe, in_axes=(0, None))(state.env_states, params)
+    observed = _observer(config, params)(state.env_states)
     action, _ = sac.act(state.learner.policy, observed).sample(key_action)
     env_states, transition = _advance(config, params, state.env_states, action, at, key_reset)
     buffer = replay.insert(state.buffer, transition)

@@ -49,7 +49,7 @@ class Setting:
     def params(self) -> EnvParams:
         craft = Spacecraft(*(jnp.array(x, jnp.float32) for x in (self.inertia, self.boresight, self.torque_limit)))
         shared = jax.tree.map(lambda leaf: jnp.full(SAMPLES, leaf), task.env_params(TaskConfig()).reward)
-        return EnvParams(craft, shared, jnp.array(self.dt, jnp.float32))
+        return EnvParams(craft, shared, jnp.array(self.dt, jnp.float32), jnp.zeros((SAMPLES, 3)))
 
     def scenario(self) -> Scenario:
         return Scenario(

@@ -18,7 +18,8 @@ from koz_jax.run_folder import RunFolder
 JSON_KEYS = [
     *("cases", "seed", "agent", "mean_reward", "std_reward", "settling_time_mean", "settling_time_std"),
     *("control_effort_mean", "control_effort_std", "control_accuracy_deg_mean", "control_accuracy_deg_std"),
-    *("non_settled_rate", "violation_rate", "success_rate", "compile_s", "wall_s"),
+    *("non_settled_rate", "violation_rate", "success_rate"),
+    *("min_margin_deg", "intervention_rate", "mean_torque_change", "deadlock_rate", "compile_s", "wall_s"),
 ]
 
 
@@ -47,7 +48,7 @@ def empty_cwd(tmp_path, monkeypatch) -> Path:
 @pytest.fixture
 def no_flight(monkeypatch) -> None:
     """Make an error of any flight."""
-    for name in ("_fly_cases", "_fly_and_judge"):
+    for name in ("_fly_cases", "_keep_and_judge"):
         monkeypatch.setattr(evaluation, name, lambda *_, **__: pytest.fail("something was flown"))
 
 

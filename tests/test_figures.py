@@ -53,6 +53,7 @@ def outcomes(cases: int, seed: int = 0) -> CaseResult:
         "min_margin": np.where(violated, -0.1, 0.1),
         "settled": settled,
         "violated": violated,
+        **tiny.unshielded(len(settled)),
     }
     return CaseResult(**leaves)
 

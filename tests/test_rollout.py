@@ -6,11 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
-from flax import struct
 
-from koz_jax import observation, reward, rollout, scenario, task
+from koz_jax import env, reward, rollout, scenario, task
+from koz_jax.controllers.base import Memoryless
 from koz_jax.dynamics import RigidBodyState
-from koz_jax.env import EnvParams
+from koz_jax.env import EnvParams, EnvState
 from koz_jax.keep_out import NO_ZONE_HALF_ANGLE, KeepOutZone
 from koz_jax.reward import RewardTerms
 from koz_jax.rollout import CaseResult, History
@@ -25,15 +25,14 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0)
 RESOLUTION = 2e-6
 
 
-class ProportionalDerivative(struct.PyTreeNode):
+class ProportionalDerivative(Memoryless):
     """Action -(gain q_e_vec + damping w): enough to fly a maneuver, and ignorant of the zone."""
 
     gain: jax.Array
     damping: jax.Array
 
-    def act(self, observed: jax.Array) -> jax.Array:
-        q_e, omega = (observed[observation.SLICES[name]] for name in ("q_e", "omega_BN_B"))
-        return -(self.gain * q_e[1:] + self.damping * omega)
+    def decide(self, state: EnvState, params: EnvParams, memory: None) -> tuple[jax.Array, None]:
+        return -(self.gain * env.attitude_error(state)[1:] + self.damping * state.body.omega_BN_B), memory
 
 
 def _pd(gain: float, damping: float) -> ProportionalDerivative:
@@ -140,7 +139,8 @@ def test_each_row_follows_from_the_one_before_by_its_torque(histories, name):
 
 def test_torque_of_a_row_is_what_the_controller_answers_to_its_observation(histories, stacked):
     for i in range(len(NAMES)):
-        actions = jax.vmap(ProportionalDerivative.act, in_axes=(None, 0))(_one(stacked[0], i), histories.observation[i])
+        pd, seen = _one(stacked[0], i), histories.observation[i]
+        actions = -(pd.gain * seen[:, 1:4] + pd.damping * seen[:, 4:7])
         np.testing.assert_allclose(histories.torque_B[i, :-1], 2.0 * np.clip(actions, -1, 1)[:-1], rtol=1e-4, atol=1e-5)
     np.testing.assert_array_equal(histories.torque_B[:, -1], histories.torque_B[:, -2])
 

@@ -32,7 +32,9 @@ def test_an_agent_knows_where_it_comes_from(name):
 
 def test_phase_1_flies_through_the_zone_of_the_papers_scenario_and_phase_2_around_it():
     _, through = evaluation.fly_scenario(load_agent("phase1"), scenario.paper_test())
-    _, around = evaluation.fly_scenario(load_agent("phase2"), scenario.paper_test(), substeps=4)
+    _, around = evaluation.fly_scenario(
+        load_agent("phase2"), scenario.paper_test(), config=MonteCarloConfig(substeps=4)
+    )
     assert through.settled and through.violated
     assert around.settled and not around.violated
 

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+import tiny
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
@@ -31,6 +32,7 @@ def _results(settled: np.ndarray, violated: np.ndarray, seed: int = 0) -> CaseRe
         min_margin=np.where(violated, -0.01, 0.1).astype(np.float32),
         settled=settled,
         violated=violated,
+        **tiny.unshielded(count),
     )
     return CaseResult(reward_terms=RewardTerms(**terms), **leaves)
 

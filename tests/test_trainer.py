@@ -524,6 +524,7 @@ def test_the_score_of_a_phase_counts_what_it_asks_for():
         min_margin=jnp.array([1.0, -1.0, 1.0]),
         settled=jnp.array([True, True, False]),
         violated=jnp.array([False, True, False]),
+        **tiny.unshielded(3),
     )
     # Phase 1 ends with zone weight 0, phase 2 with 1.
     assert trainer.score(results, CONFIG, 1) == pytest.approx((100 + 10) / 3)

@@ -15,6 +15,7 @@ from unittest import mock
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.experimental.compilation_cache import compilation_cache
 
 from koz_jax import observation
@@ -154,3 +155,12 @@ def untrained_agent(seed: int = 0) -> Agent:
     policy = policy_network(network).init(jax.random.key(seed), jnp.zeros(observation.SIZE))
     provenance = Provenance(command="python train.py", seed=seed, phase=2, updates=128, table={"cases": 8, "name": "x"})
     return Agent(PolicyController(policy, network), CONFIG.task, provenance, "untrained")
+
+
+def unshielded(cases: int) -> dict[str, Any]:
+    """What the outcomes of so many cases say of a shield where there was none."""
+    return {
+        "intervention_rate": np.zeros(cases, np.float32),
+        "mean_torque_change": np.zeros(cases, np.float32),
+        "deadlocked": np.zeros(cases, bool),
+    }

@@ -1,0 +1,93 @@
+"""Controllers that do their worst, to try the shield: none of them knows what is good for the telescope."""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from koz_jax import dynamics, rotations
+from koz_jax.controllers.base import Memoryless
+from koz_jax.env import EnvParams, EnvState
+
+
+class _Drawn(struct.PyTreeNode):
+    """An action that is held, and the key for the next one."""
+
+    key: jax.Array
+    action: jax.Array  # (3,)
+
+
+class Random(struct.PyTreeNode):
+    """Uniform torque in the box, a new one at every step."""
+
+    def begin(self, state: EnvState, params: EnvParams, key: jax.Array) -> jax.Array:
+        """Remember the key."""
+        return key
+
+    def decide(self, state: EnvState, params: EnvParams, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Draw an action (3,)."""
+        key, key_action = jax.random.split(memory)
+        return jax.random.uniform(key_action, (3,), minval=-1.0, maxval=1.0), key
+
+
+class BangBang(struct.PyTreeNode):
+    """Full throttle: a random corner of the torque box, held for some seconds at a time."""
+
+    hold: jax.Array = struct.field(default_factory=lambda: jnp.float32(4.0))  # () [s]
+
+    def begin(self, state: EnvState, params: EnvParams, key: jax.Array) -> _Drawn:
+        """Draw the first corner."""
+        return self._draw(key)
+
+    def decide(self, state: EnvState, params: EnvParams, memory: _Drawn) -> tuple[jax.Array, _Drawn]:
+        """Action (3,): the corner that is held."""
+        steps = jnp.maximum(jnp.round(self.hold / params.dt).astype(jnp.int32), 1)
+        again = (state.steps % steps == 0) & (state.steps > 0)
+        fresh = self._draw(memory.key)
+        memory = jax.tree.map(lambda new, old: jnp.where(again, new, old), fresh, memory)
+        return memory.action, memory
+
+    @staticmethod
+    def _draw(key: jax.Array) -> _Drawn:
+        key, key_action = jax.random.split(key)
+        return _Drawn(key, jax.random.rademacher(key_action, (3,), jnp.float32))
+
+
+class Adversary(Memoryless):
+    """Steers the boresight into the first zone with all its might, damping only what does not lead there."""
+
+    def decide(self, state: EnvState, params: EnvParams, memory: None) -> tuple[jax.Array, None]:
+        """Action (3,) at the edge of the box."""
+        return _full(_towards_zone(state, params) - _aside(state, params), params), memory
+
+
+class SpinUp(Memoryless):
+    """Builds up rate for some seconds away from the zone's direction, then steers into the zone."""
+
+    spin_seconds: jax.Array = struct.field(default_factory=lambda: jnp.float32(20.0))  # () [s]
+    axis_B: jax.Array = struct.field(default_factory=lambda: jnp.array([1.0, 1.0, 1.0]))  # (3,) spun up about
+
+    def decide(self, state: EnvState, params: EnvParams, memory: None) -> tuple[jax.Array, None]:
+        """Action (3,)."""
+        seconds = state.steps * params.dt
+        steer = _full(_towards_zone(state, params), params)
+        return jnp.where(seconds < self.spin_seconds, self.axis_B, steer), memory
+
+
+def _towards_zone(state: EnvState, params: EnvParams) -> jax.Array:
+    """Body axis (3,) about which a turn brings the boresight to the first zone, of unit length."""
+    axis_B = rotations.rotate(rotations.conjugate(state.body.q_BN), state.scenario.zones.axis_N[0])
+    turn_B = rotations.cross(params.spacecraft.boresight_B, axis_B)
+    return turn_B / jnp.maximum(rotations.norm(turn_B), 1e-6)
+
+
+def _aside(state: EnvState, params: EnvParams) -> jax.Array:
+    """Part of the rate (3,) [rad/s] that does not lead to the zone, weighed so that it is damped in seconds."""
+    towards_B = _towards_zone(state, params)
+    omega_B = state.body.omega_BN_B
+    return 10.0 * (omega_B - rotations.dot(omega_B, towards_B) * towards_B)
+
+
+def _full(acceleration_B: jax.Array, params: EnvParams) -> jax.Array:
+    """Largest action (3,) within the box that accelerates along a body axis (3,)."""
+    torque_B = dynamics.matvec(params.spacecraft.inertia_B, acceleration_B)
+    return torque_B / jnp.maximum(jnp.max(jnp.abs(torque_B)), 1e-9)
