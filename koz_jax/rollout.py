@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from koz_jax import env, keep_out, observation, reward, uncertainty
+from koz_jax import env, keep_out, observation, reward, shield, uncertainty
 from koz_jax.controllers.base import Controller, Memory
 from koz_jax.env import EnvParams, EnvState
 from koz_jax.reward import RewardTerms
@@ -101,8 +101,14 @@ def _margin_between(state: EnvState, torque_B: jax.Array, params: EnvParams, sub
 def _take_off(
     controller: Controller, scenario: Scenario, params: EnvParams, conditions: Conditions, key: jax.Array
 ) -> tuple[_Flight, EnvParams]:
-    """The flight at its start, and the truth that it meets: what is uncertain is drawn for the whole maneuver."""
+    """The flight at its start, and the truth that it meets: what is uncertain is drawn for the whole maneuver.
+
+    A start that the shield does not call safe is slowed down until it is.
+    """
     key_controller, key_truth, key_noise = jax.random.split(key, 3)
+    if conditions.shield is not None:
+        begin = shield.slow_down(conditions.shield, scenario.initial, scenario.zones, params)
+        scenario = scenario.replace(initial=begin)
     state = env.reset(scenario)
     truth = params
     if conditions.uncertainty is not None:

@@ -59,23 +59,40 @@ _BRAKE = 3
 
 
 def for_spacecraft(config: ShieldConfig, spacecraft: Spacecraft, dt: jax.Array) -> Shield:
-    """Make a shield with a margin for the errors that ``config`` allows."""
+    """Make a shield with a margin for the errors that ``config`` withstands."""
+    errors = config.withstands
     moments = jnp.linalg.eigvalsh(spacecraft.inertia_B)
     limit = spacecraft.torque_limit
-    brake = limit - config.disturbance_torque
-    kick = jnp.sqrt(3.0) * limit * config.inertia_error + config.disturbance_torque
-    rate_noise = NOISE_BOUND * jnp.sqrt(3.0) * jnp.deg2rad(config.rate_noise_deg)
-    attitude_noise = NOISE_BOUND * jnp.sqrt(3.0) * jnp.deg2rad(config.attitude_noise_deg)
+    brake = limit - errors.disturbance_torque
+    # Of the torque in a step, this much may push elsewhere than the model says.
+    astray = jnp.sqrt(3.0) * limit * errors.inertia_error + errors.disturbance_torque
+    attitude_noise, rate_noise = (
+        NOISE_BOUND * jnp.sqrt(3.0) * jnp.deg2rad(deviation)
+        for deviation in (errors.attitude_noise_deg, errors.rate_noise_deg)
+    )
     return Shield(
         margin=jnp.deg2rad(jnp.float32(config.margin_deg)) + 2.0 * attitude_noise,
         brake_torque=brake,
-        arc_error=2.0 * config.inertia_error / (1.0 - config.inertia_error) + config.disturbance_torque / brake,
-        rate_error=rate_noise + kick * dt / moments[0],
+        arc_error=2.0 * errors.inertia_error / (1.0 - errors.inertia_error) + errors.disturbance_torque / brake,
+        rate_error=rate_noise + astray * dt / moments[0],
         guide_rate=jnp.deg2rad(jnp.float32(config.guide_rate_deg)),
         smallest_moment=moments[0],
         largest_moment=moments[2],
         samples=config.samples,
     )
+
+
+def slow_down(shield: Shield, body: RigidBodyState, zones: KeepOutZone, params: EnvParams) -> RigidBodyState:
+    """Halve the rate until the state is safe; a state at rest that is not is returned at rest.
+
+    The guarantee holds from safe states only, so this is where a maneuver under the shield may begin.
+    """
+
+    def too_fast(body: RigidBodyState) -> jax.Array:
+        moves = rotations.norm(body.omega_BN_B) > 1e-9
+        return moves & ~is_safe(shield, body, zones, params, shield.margin)
+
+    return jax.lax.while_loop(too_fast, lambda body: body.replace(omega_BN_B=0.5 * body.omega_BN_B), body)
 
 
 def brake_torque(shield: Shield, body: RigidBodyState, params: EnvParams) -> jax.Array:

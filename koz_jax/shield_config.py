@@ -18,11 +18,16 @@ class UncertaintyConfig(Settings):
     """Standard deviation per axis of the measured rate [deg/s], cut at 3 times that."""
 
 
-class ShieldConfig(UncertaintyConfig):
-    """The shield; the fields of ``UncertaintyConfig`` are what it withstands."""
+CERTAIN = UncertaintyConfig()
+
+
+class ShieldConfig(Settings):
+    """The shield."""
 
     margin_deg: PositiveFloat = 0.1
-    """Angle kept from every zone [deg]; more is kept where attitude noise is allowed."""
+    """Angle kept from every zone [deg]; more is kept where attitude noise is withstood."""
+    withstands: UncertaintyConfig = CERTAIN
+    """Errors for which the guarantee holds."""
     guide_rate_deg: PositiveFloat = 6.0
     """Rate with which the boresight is led around a zone [deg/s]."""
     samples: PositiveInt = 12

@@ -36,6 +36,10 @@ REPORT_KEYS = [
     "non_settled_rate",
     "violation_rate",
     "success_rate",
+    "min_margin_deg",
+    "intervention_rate",
+    "mean_torque_change",
+    "deadlock_rate",
     "compile_s",
     "wall_s",
 ]
