@@ -5,36 +5,23 @@ from __future__ import annotations
 import dataclasses
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import tyro
 
 from koz_jax.errors import UserError, exit_status
+from koz_jax.flight_args import FlightArgs
 
 if TYPE_CHECKING:
-    from koz_jax.agent import Agent
+    from koz_jax.controllers.base import Pilot
     from koz_jax.evaluation import MonteCarloConfig
     from koz_jax.task_config import TaskConfig
 
 
 @dataclasses.dataclass(frozen=True)
-class EvalArgs:
-    """Fly a trained agent over many random cases and print the paper's table beside its own."""
+class EvalArgs(FlightArgs):
+    """Fly a trained agent, or another controller, over many random cases; print the paper's table beside its own."""
 
-    agent: str = "phase2"
-    """A shipped agent by name (phase1, phase2), or the folder of a run or of an agent."""
-    cases: int = 10_000
-    """Number of cases."""
-    seed: int = 0
-    """Seed of the draw; case i of a seed is always the same."""
-    min_angle_deg: float = 80.0
-    """Smallest initial deviation [deg]."""
-    max_angle_deg: float = 180.0
-    """Largest initial deviation [deg]."""
-    angle_convention: Literal["full", "half"] | None = None
-    """phi is the full rotation angle or half of it (the paper's literal equation); by default the agent's own."""
-    infeasible_zone: Literal["resample", "shrink"] | None = None
-    """Where a zone would hold start or target: draw again, or make it smaller; by default the agent's own."""
     substeps: int = 1
     """Check the zone at so many instants per time step; 1 checks at the steps only."""
     json: Path | None = None
@@ -57,18 +44,17 @@ def main(argv: list[str]) -> int:
 def _evaluate(args: EvalArgs) -> int:
     # jax is imported only now: --help and flags that do not exist are answered at once.
     from koz_jax import evaluation, runtime
-    from koz_jax.agent import load_agent
 
-    config = evaluation.MonteCarloConfig(args.cases, args.seed, args.min_angle_deg, args.max_angle_deg, args.substeps)
+    config = args.config(args.substeps)
     _check_outputs(args)
     runtime.configure()
-    agent = load_agent(args.agent)
-    task = agent.task.with_rules(args.angle_convention, args.infeasible_zone)
+    pilot = args.pilot()
+    task = args.task(pilot)
     evaluation.check_feasible(task, config.max_angle_deg)
     if args.replay_case is not None:
-        _replay(agent, task, config, args.replay_case, _history_path(args))
+        _replay(pilot, task, config, args.replay_case, _history_path(args))
     else:
-        _monte_carlo(agent, task, config, args)
+        _monte_carlo(pilot, task, config, args)
     return 0
 
 
@@ -105,22 +91,22 @@ def _check_outputs(args: EvalArgs) -> None:
         storage.make_folder("figures", args.figures)
 
 
-def _replay(agent: Agent, task: TaskConfig, config: MonteCarloConfig, case: int, path: Path) -> None:
+def _replay(pilot: Pilot, task: TaskConfig, config: MonteCarloConfig, case: int, path: Path) -> None:
     from koz_jax import evaluation, storage, tables
 
-    history, result = evaluation.fly_case(agent, case, config, task)
+    history, result = evaluation.fly_case(pilot, case, config, task)
     storage.write_text(path, tables.history_csv(history, task))
     print(tables.describe_case(case, result))
     print(f"history: {path}")
 
 
-def _monte_carlo(agent: Agent, task: TaskConfig, config: MonteCarloConfig, args: EvalArgs) -> None:
+def _monte_carlo(pilot: Pilot, task: TaskConfig, config: MonteCarloConfig, args: EvalArgs) -> None:
     from koz_jax import evaluation, storage, tables
     from koz_jax.summary import summarise, table
 
-    flown = evaluation.run_cases(agent, task, config)
+    flown = evaluation.run_cases(pilot, task, config)
     summary = summarise(flown.results)
-    print(table(summary, config.cases, args.agent))
+    print(table(summary, config.cases, args.name, args.shield))
     print(f"compiled in {flown.compile_s:.1f} s, flown in {flown.wall_s:.1f} s")
     if args.json:
         storage.write_json(args.json, evaluation.report(flown, summary))
@@ -129,7 +115,7 @@ def _monte_carlo(agent: Agent, task: TaskConfig, config: MonteCarloConfig, args:
     if args.figures:
         from koz_jax.figures import monte_carlo, style
 
-        title = f"{style.short_name(args.agent)}: {config.cases} random cases, seed {config.seed}"
+        title = f"{style.short_name(args.name)}: {config.cases} random cases, seed {config.seed}"
         for path in monte_carlo.write(args.figures, flown.results, task, title):
             print(f"figure: {path}")
 

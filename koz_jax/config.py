@@ -25,6 +25,7 @@ from koz_jax.settings import (
     constant,
     ramp_value,
 )
+from koz_jax.shield_config import ShieldConfig
 from koz_jax.task_config import TaskConfig
 
 
@@ -186,6 +187,17 @@ class RefineConfig(Settings):
         return self
 
 
+class ShieldingConfig(Settings):
+    """Training under the shield, so that the agent learns to live with it."""
+
+    enabled: bool = False
+    """Put the shield between policy and actuators, in training and in its evaluations."""
+    intervention_cost: NonNegativeFloat = 0.0
+    """Cost per step of the norm of what the shield changes of the action; 0 does not penalise it."""
+    shield: ShieldConfig = ShieldConfig()
+    """The shield."""
+
+
 class TrainConfig(Settings):
     """One training run."""
 
@@ -201,6 +213,8 @@ class TrainConfig(Settings):
     """In what order it learns."""
     refine: RefineConfig = RefineConfig()
     """How the result is polished."""
+    shielding: ShieldingConfig = ShieldingConfig()
+    """Whether it learns under the shield."""
     num_envs: PositiveInt = 1
     """Environments that run in parallel."""
     updates_per_step: PositiveInt = 1

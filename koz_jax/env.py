@@ -79,5 +79,6 @@ def step(state: EnvState, action: jax.Array, params: EnvParams) -> tuple[EnvStat
         torque=rotations.norm(torque_B),
         torque_change=change,
         zone_margin=keep_out.smallest_margin(boresight_N(next_state.body, params.spacecraft), state.scenario.zones),
+        intervention=jnp.zeros(()),
     )
     return next_state, outcome

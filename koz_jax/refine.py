@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from koz_jax import env, observation, scenario, task
+from koz_jax import env, observation, scenario, shield, task
 from koz_jax.agent import PolicyController
 from koz_jax.config import RefineConfig, TrainConfig
 from koz_jax.env import EnvParams, EnvState
 from koz_jax.reward import Outcome
 from koz_jax.sac.networks import Params
-from koz_jax.training import MAX_DRAWS
+from koz_jax.training import MAX_DRAWS, make_shield
 
 
 class RefineState(struct.PyTreeNode):
@@ -77,11 +77,15 @@ def maneuver_cost(controller: PolicyController, key: jax.Array, config: TrainCon
     ranges = task.scenario_ranges(config.task.scenario, config.refine.min_angle_deg, config.refine.max_angle_deg)
     boresight_B = params.spacecraft.boresight_B
     rule = config.task.scenario.infeasible_zone
+    guard = make_shield(config, params)
     drawn = scenario.sample(key, ranges, boresight_B, rule, MAX_DRAWS, keep_angle=True)
 
     def advance(state: EnvState, _: None) -> tuple[EnvState, jax.Array]:
         action = controller.act(observation.observe(state, params, config.network.observed_zones))
-        state, outcome = env.step(state, action, params)
+        # The gradient passes the shield as if it were not there: it branches, and has none of its own.
+        held, asked = jax.lax.stop_gradient((state, action))
+        change = shield.guard(guard, held, asked, params) - jnp.clip(asked, -1.0, 1.0)
+        state, outcome = env.step(state, action + change, params)
         return state, step_cost(outcome, params, config.refine)
 
     _, costs = jax.lax.scan(advance, env.reset(drawn), None, length=config.refine_steps)

@@ -32,6 +32,7 @@ class Outcome(struct.PyTreeNode):
     torque: jax.Array  # () [N m] norm of the torque
     torque_change: jax.Array  # () [N m] norm of its change since the step before; 0 in the first step
     zone_margin: jax.Array  # () [rad] margin to the nearest zone after the step
+    intervention: jax.Array  # () norm of what a shield changed of the action; 0 without a shield
 
 
 class RewardTerms(struct.PyTreeNode):
@@ -44,10 +45,11 @@ class RewardTerms(struct.PyTreeNode):
     zone: jax.Array | float
     no_progress: jax.Array | float
     effort: jax.Array | float  # not in the paper: squared torque, which is what control effort integrates
+    intervention: jax.Array | float  # not in the paper: what a shield changed of the action
 
 
 PAPER_WEIGHTS = RewardTerms(
-    attitude=1.0, settled=1.0, torque=1.0, torque_change=1.0, zone=1.0, no_progress=1.0, effort=0.0
+    attitude=1.0, settled=1.0, torque=1.0, torque_change=1.0, zone=1.0, no_progress=1.0, effort=0.0, intervention=0.0
 )
 
 
@@ -84,6 +86,7 @@ def terms(outcome: Outcome, params: RewardParams, torque_limit: jax.Array) -> Re
         zone=-zone_penalty(outcome.zone_margin, params),
         no_progress=-params.no_progress_cost * (1.0 - progress),
         effort=-squared_action,
+        intervention=-outcome.intervention,
     )
 
 

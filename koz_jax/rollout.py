@@ -125,13 +125,8 @@ def _command(
         key = jax.random.fold_in(flight.key, flight.state.steps)
         measured = uncertainty.measure(conditions.uncertainty, flight.state, key)
     action, memory = controller.decide(measured, params, flight.memory)
-    requested = jnp.clip(action, -1.0, 1.0)
-    applied = requested
-    if conditions.shield is not None:
-        limit = params.spacecraft.torque_limit
-        allowed_B = conditions.shield.filter(measured.body, limit * requested, measured.scenario.zones, params)
-        applied = allowed_B / limit
-    return _Command(requested, applied), memory
+    applied = shield.guard(conditions.shield, measured, action, params)
+    return _Command(jnp.clip(action, -1.0, 1.0), applied), memory
 
 
 def run_case(

@@ -15,7 +15,7 @@ from flax import struct
 
 from koz_jax import dynamics, env, keep_out, rotations
 from koz_jax.dynamics import RigidBodyState, Spacecraft
-from koz_jax.env import EnvParams
+from koz_jax.env import EnvParams, EnvState
 from koz_jax.keep_out import KeepOutZone
 from koz_jax.shield_config import ShieldConfig
 from koz_jax.uncertainty import NOISE_BOUND
@@ -52,6 +52,18 @@ class Shield(struct.PyTreeNode):
             lambda tried: (tried < _BRAKE) & refused(tried), lambda tried: tried + 1, jnp.int32(0)
         )
         return candidates_B[chosen]
+
+
+def guard(shield: Shield | None, state: EnvState, action: jax.Array, params: EnvParams) -> jax.Array:
+    """What of an action (3,) reaches the actuators: clipped to [-1, 1], and changed where a shield says so."""
+    requested = jnp.clip(action, -1.0, 1.0)
+    if shield is None:
+        return requested
+    limit = params.spacecraft.torque_limit
+    torque_B = limit * requested
+    allowed_B = shield.filter(state.body, torque_B, state.scenario.zones, params)
+    # What passes comes back to the last bit, also where the limit is no power of two.
+    return jnp.where(jnp.all(allowed_B == torque_B), requested, allowed_B / limit)
 
 
 # Place of the brake among the candidates: what is left when all others are refused.

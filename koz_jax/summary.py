@@ -88,8 +88,8 @@ def wilson_interval(rate: float, cases: int) -> tuple[float, float]:
     return max(0.0, centre - half_width), min(1.0, centre + half_width)
 
 
-def table(summary: Summary, cases: int, name: str) -> str:
-    """The paper's table with ours beside it, as text."""
+def table(summary: Summary, cases: int, name: str, shielded: bool = False) -> str:
+    """The paper's table with ours beside it, as text; with what the shield did where there was one."""
     ours, paper = summary, PAPER_TABLE
 
     def spread(label: str, field: str, digits: int) -> tuple[str, str, str]:
@@ -119,7 +119,14 @@ def table(summary: Summary, cases: int, name: str) -> str:
         rate("not settled", "non_settled_rate"),
         rate("violated", "violation_rate"),
         rate("success", "success_rate", 0),
+        ("smallest margin [deg]", "", f"{ours.min_margin_deg:.3f}"),
     ]
+    if shielded:
+        rows += [
+            ("shield intervened, of all steps", "", f"{100 * ours.intervention_rate:.2f} %"),
+            ("mean change of torque [N m]", "", f"{ours.mean_torque_change:.4f}"),
+            ("deadlocked", "", f"{100 * ours.deadlock_rate:.2f} %"),
+        ]
     widths = [max(len(row[column]) for row in rows) for column in range(3)]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
     lines.insert(1, "-" * max(map(len, lines)))

@@ -34,6 +34,9 @@ def cases_csv(results: CaseResult) -> str:
             "control_effort_N2m2s": np.asarray(results.control_effort),
             "control_accuracy_deg": np.rad2deg(results.control_accuracy),
             "min_margin_deg": np.rad2deg(results.min_margin),
+            "intervention_rate": np.asarray(results.intervention_rate),
+            "mean_torque_change_Nm": np.asarray(results.mean_torque_change),
+            "deadlocked": np.asarray(results.deadlocked),
             "settled": np.asarray(results.settled),
             "violated": np.asarray(results.violated),
         }

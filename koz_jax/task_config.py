@@ -120,10 +120,11 @@ class TaskConfig(Settings):
         angle_convention: Literal["full", "half"] | None = None,
         infeasible_zone: Literal["resample", "shrink"] | None = None,
         zones: int | None = None,
+        max_rate_deg: float | None = None,
     ) -> TaskConfig:
         """Judge the same task by another angle convention, or draw it by another rule; None keeps what is set.
 
-        zones: number of zones of every case.
+        zones: number of zones of every case; max_rate_deg: largest initial rate per axis [deg/s].
         """
         changed = self.model_dump()
         if angle_convention is not None:
@@ -132,6 +133,8 @@ class TaskConfig(Settings):
             changed["scenario"]["infeasible_zone"] = infeasible_zone
         if zones is not None:
             changed["scenario"] |= {"min_zones": zones, "max_zones": zones}
+        if max_rate_deg is not None:
+            changed["scenario"]["max_rate_deg"] = max_rate_deg
         return TaskConfig.model_validate(changed)
 
     @model_validator(mode="after")

@@ -196,7 +196,11 @@ class _Run:
         learned = done <= curriculum_config.updates
         learner = state.train.learner if learned else state.best.replace(averaged_policy=state.refine.policy)
         cases = MonteCarloConfig(
-            self.config.eval_cases, _EVAL_SEED, self.config.eval_min_angle_deg, self.config.eval_max_angle_deg
+            self.config.eval_cases,
+            _EVAL_SEED,
+            self.config.eval_min_angle_deg,
+            self.config.eval_max_angle_deg,
+            shield=self.config.shielding.shield if self.config.shielding.enabled else None,
         )
         controller = PolicyController(learner.averaged_policy, self.config.network)
         results = evaluation.fly_cases(controller, self.config.task, cases)

@@ -7,16 +7,17 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from koz_jax import curriculum, env, observation, reward, scenario, task
+from koz_jax import curriculum, env, observation, reward, scenario, shield, task
 from koz_jax.config import TrainConfig
 from koz_jax.curriculum import Difficulty
 from koz_jax.env import EnvParams, EnvState
-from koz_jax.reward import RewardTerms
+from koz_jax.reward import Outcome, RewardTerms
 from koz_jax.sac import learner as sac_learner
 from koz_jax.sac import replay
 from koz_jax.sac.learner import LearnerMetrics, LearnerState, Sac
 from koz_jax.sac.losses import Batch
 from koz_jax.sac.replay import ReplayBuffer, Transition
+from koz_jax.shield import Shield
 
 ACTION_SIZE = 3
 
@@ -79,6 +80,13 @@ def _reset_envs(config: TrainConfig, params: EnvParams, at: Difficulty, key: jax
     return jax.vmap(fresh)(jax.random.split(key, config.num_envs))
 
 
+def make_shield(config: TrainConfig, params: EnvParams) -> Shield | None:
+    """The shield to train under, if there is one."""
+    if not config.shielding.enabled:
+        return None
+    return shield.for_spacecraft(config.shielding.shield, params.spacecraft, params.dt)
+
+
 def _observer(config: TrainConfig, params: EnvParams) -> Callable[[EnvState], jax.Array]:
     """Observations (environments, entries) of all environments."""
     return jax.vmap(lambda state: observation.observe(state, params, config.network.observed_zones))
@@ -89,7 +97,14 @@ def _advance(
 ) -> tuple[EnvState, Transition]:
     """One step of all environments; those at the end of their episode start a new scenario."""
     observe = _observer(config, params)
-    next_states, outcome = jax.vmap(env.step, in_axes=(0, 0, None))(states, action, params)
+    guard = make_shield(config, params)
+
+    def step(state: EnvState, action: jax.Array) -> tuple[EnvState, Outcome]:
+        applied = shield.guard(guard, state, action, params)
+        next_state, outcome = env.step(state, applied, params)
+        return next_state, outcome.replace(intervention=jnp.linalg.norm(applied - jnp.clip(action, -1.0, 1.0)))
+
+    next_states, outcome = jax.vmap(step)(states, action)
     truncated = next_states.steps >= config.training_episode_steps
     transition = Transition(
         observation=observe(states),
@@ -158,7 +173,8 @@ def _rewarded_batch(
     windows = replay.sample_windows(buffer, key, count, config.sac.n_step)
     reward_params = curriculum.reward_params(at, params.reward)
     terms = reward.terms(windows.outcome, reward_params, params.spacecraft.torque_limit)
-    rewards = config.sac.reward_scale * reward.total(terms, curriculum.reward_weights(at))
+    weights = curriculum.reward_weights(at).replace(intervention=config.shielding.intervention_cost)
+    rewards = config.sac.reward_scale * reward.total(terms, weights)
     return replay.n_step_batch(windows, rewards, at.discount)
 
 

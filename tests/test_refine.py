@@ -25,7 +25,7 @@ def policy():
 
 
 def outcome(angle=0.0, torque=0.0, margin=1.0):
-    return Outcome(*map(jnp.float32, (angle, angle, torque, 0.0, margin)))
+    return Outcome(*map(jnp.float32, (angle, angle, torque, 0.0, margin, 0.0)))
 
 
 def mean_cost(policy, keys):

@@ -35,6 +35,7 @@ def half() -> RewardParams:
 
 def _outcome(**measured: float | np.floating) -> Outcome:
     defaults = {"angle": 1.0, "angle_previous": 1.1, "torque": 0.0, "torque_change": 0.0, "zone_margin": 1.0}
+    defaults["intervention"] = 0.0
     return Outcome(**{name: jnp.float32(value) for name, value in (defaults | measured).items()})
 
 
@@ -61,6 +62,7 @@ def test_every_term_agrees_with_the_oracle(convention, factor, request):
         torque=jnp.array(np.linalg.norm(torque, axis=1), jnp.float32),
         torque_change=jnp.array(np.linalg.norm(torque - torque_previous, axis=1), jnp.float32),
         zone_margin=jnp.array(margin, jnp.float32),
+        intervention=jnp.zeros(count),
     )
     found = _terms_batch(outcome, params, TORQUE_LIMIT)
     total = jax.vmap(reward.total, in_axes=(0, None))(found, PAPER_WEIGHTS)
