@@ -42,16 +42,16 @@ class Shield(struct.PyTreeNode):
         candidates_B = jnp.stack([torque_B, 0.5 * (torque_B + guide_B), guide_B, brake_torque(self, body, params)])
         margins = self.margin * jnp.array([1.0, 1.0, 0.5])
 
-        # Loops, not branches: a batch then computes no more than its most critical case needs.
-        def refused(tried: jax.Array) -> jax.Array:
-            after = env.push(body, candidates_B[tried], params, params.dt)
+        def attempt(choice: _Choice) -> _Choice:
+            after = env.push(body, candidates_B[choice.candidate], params, params.dt)
             clear = _step_clearance(self, body, after, zones, params)
-            return ~(clear & is_safe(self, after, zones, params, margins[tried]))
+            passed = clear & is_safe(self, after, zones, params, margins[choice.candidate])
+            return _Choice(jnp.where(passed, choice.candidate, choice.candidate + 1), passed)
 
-        chosen = jax.lax.while_loop(
-            lambda tried: (tried < _BRAKE) & refused(tried), lambda tried: tried + 1, jnp.int32(0)
-        )
-        return candidates_B[chosen]
+        # A loop, not a branch: a batch then computes no more than its most critical case needs.
+        first = _Choice(jnp.int32(0), jnp.array(False))
+        last = jax.lax.while_loop(lambda choice: ~choice.made & (choice.candidate < _BRAKE), attempt, first)
+        return candidates_B[last.candidate]
 
 
 def guard(shield: Shield | None, state: EnvState, action: jax.Array, params: EnvParams) -> jax.Array:
@@ -64,6 +64,13 @@ def guard(shield: Shield | None, state: EnvState, action: jax.Array, params: Env
     allowed_B = shield.filter(state.body, torque_B, state.scenario.zones, params)
     # What passes comes back to the last bit, also where the limit is no power of two.
     return jnp.where(jnp.all(allowed_B == torque_B), requested, allowed_B / limit)
+
+
+class _Choice(struct.PyTreeNode):
+    """Which of the candidates is let through."""
+
+    candidate: jax.Array  # () int32
+    made: jax.Array  # () bool
 
 
 # Place of the brake among the candidates: what is left when all others are refused.
