@@ -226,7 +226,7 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
         raise UserError(f"{path}: cannot be read as arrays: {error}") from None
 
 
-def _named_leaves(tree: Any) -> dict[str, Any]:
+def named_leaves(tree: Any) -> dict[str, Any]:
     """Leaves by their path in the tree, such as ``learner/policy/params/kernel``."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
@@ -246,11 +246,11 @@ def to_arrays(tree: Any) -> dict[str, np.ndarray]:
 
     A view would not do: the memory of a state is used again as soon as training goes on.
     """
-    return {name: np.array(leaf) for name, leaf in _named_leaves(key_data(tree)).items()}
+    return {name: np.array(leaf) for name, leaf in named_leaves(key_data(tree)).items()}
 
 
 def _from_arrays(arrays: dict[str, np.ndarray], template: Any, path: Path) -> Any:
-    wanted = _named_leaves(template)
+    wanted = named_leaves(template)
     if wanted.keys() != arrays.keys():
         missing, extra = sorted(wanted.keys() - arrays.keys()), sorted(arrays.keys() - wanted.keys())
         raise UserError(f"{path}: holds other arrays than expected: missing {missing[:3]}, unexpected {extra[:3]}")

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import koz_jax
-from koz_jax import curriculum, evaluation, memory, refine, reward, storage, training
+from koz_jax import curriculum, evaluation, memory, refine, reward, storage, training, watch
 from koz_jax.agent import Agent, PolicyController, Provenance
 from koz_jax.config import TrainConfig
 from koz_jax.errors import UserError
@@ -153,6 +153,7 @@ class _Run:
         self.bar = bar
         self.stop = stop
         self.writer = Writer()
+        self.warned = False  # that the critic diverges
         phase1, learned = config.curriculum.phase1.updates, config.curriculum.updates
         self.evaluations = sorted(
             {
@@ -221,6 +222,11 @@ class _Run:
         steps = (end - done) // self.config.updates_per_step
         train_state, metrics = training.train_chunk(self.config, state.train, jnp.int32(steps))
         metrics = jax.device_get(metrics)
+        watch.check(end, int(metrics.fault), {"learner": train_state.learner, "environments": train_state.env_states})
+        warning = watch.divergence(self.config, metrics.learner)
+        if warning is not None and not self.warned:
+            self.bar.warn(f"update {end}: {warning}")
+            self.warned = True
         at = curriculum.difficulty(self.config.curriculum, jnp.int32(end))
         values = {
             "env_steps": (self.config.prefill_steps + end // self.config.updates_per_step) * self.config.num_envs,
@@ -235,6 +241,7 @@ class _Run:
         done = state.done
         end = self._chunk_end(done, self.config.refine_log_every)
         refined, cost = refine.refine_chunk(self.config, state.refine, jnp.int32(end - done))
+        watch.check(end, watch.SOUND, {"refine/cost": cost, "refine/state": refined})
         return state.replace(refine=refined), {"refine/cost": float(cost)}
 
     def _evaluate(self, state: RunState) -> tuple[RunState, dict[str, float]]:
@@ -253,6 +260,7 @@ class _Run:
         controller = PolicyController(learner.averaged_policy, self.config.network)
         results = evaluation.fly_cases(controller, self.config.task, cases)
         found, summary = score(results, self.config, phase), summarise(results)
+        watch.check(done, watch.SOUND, {"eval/score": jnp.float32(found)})
         self.bar.evaluated(summary)
         if found > float(state.best_score):
             best = jax.tree.map(jnp.copy, learner)
