@@ -1,4 +1,4 @@
-"""One trainer per run folder.  The system gives the lock up when the process ends, however it ends."""
+"""One process per folder of results.  The system gives the lock up when the process ends, however it ends."""
 
 import os
 from pathlib import Path
@@ -14,14 +14,14 @@ except ImportError:  # not a POSIX system
 LOCK = "lock"
 
 
-class RunLock:
-    """Holds the file ``lock`` of a run folder."""
+class FolderLock:
+    """Holds the file ``lock`` of a folder."""
 
-    def __init__(self, folder: Path) -> None:
-        """Take the lock of an existing folder.
+    def __init__(self, folder: Path, name: str = "run") -> None:
+        """Take the lock of an existing folder.  name: the setting that gave the folder, for messages.
 
         Raises:
-            UserError: another process (or another trainer in this one) holds it, or the folder cannot be written.
+            UserError: another process (or this one already) holds it, or the folder cannot be written.
 
         """
         self._file: IO[str] | None = None
@@ -29,7 +29,7 @@ class RunLock:
         try:
             file = open(path, "a+", encoding="ascii")
         except OSError as error:
-            raise UserError(f"run: {path} cannot be written: {error.strerror}") from None
+            raise UserError(f"{name}: {path} cannot be written: {error.strerror}") from None
         if fcntl is not None:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -38,19 +38,19 @@ class RunLock:
                 holder = file.read().strip()
                 file.close()
                 raise UserError(
-                    f"run: {folder} is being trained by another process ({holder or 'unknown'}); wait for it, or"
+                    f"{name}: {folder} is in use by another process ({holder or 'unknown'}); wait for it, or"
                     " choose another folder"
                 ) from None
             except OSError as error:
                 file.close()
-                raise UserError(f"run: {path} cannot be locked: {error.strerror}") from None
+                raise UserError(f"{name}: {path} cannot be locked: {error.strerror}") from None
         try:
             file.truncate(0)
             file.write(f"pid {os.getpid()}\n")
             file.flush()
         except OSError as error:
             file.close()
-            raise UserError(f"run: {path} cannot be written: {error.strerror}") from None
+            raise UserError(f"{name}: {path} cannot be written: {error.strerror}") from None
         self._file = file
 
     def __enter__(self) -> Self:

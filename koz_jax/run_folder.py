@@ -25,7 +25,7 @@ from pydantic import ValidationError
 from koz_jax import storage
 from koz_jax.config import TrainConfig
 from koz_jax.errors import UserError, explain, warn
-from koz_jax.lock import LOCK, RunLock
+from koz_jax.lock import LOCK, FolderLock
 from koz_jax.refine import RefineState
 from koz_jax.sac.learner import LearnerState
 from koz_jax.training import TrainState
@@ -114,7 +114,7 @@ class RunFolder:
         except OSError as error:
             raise UserError(f"run: {self.path} cannot be created: {error.strerror}") from None
         try:
-            with RunLock(self.path):
+            with FolderLock(self.path):
                 yield from self._begin_locked()
         finally:
             for folder in made:

@@ -20,7 +20,7 @@ from koz_jax.config import TrainConfig
 from koz_jax.errors import UserError
 from koz_jax.evaluation import MonteCarloConfig
 from koz_jax.interrupt import StopRequest
-from koz_jax.lock import RunLock
+from koz_jax.lock import FolderLock
 from koz_jax.metrics_log import MetricsLog, flatten
 from koz_jax.progress import Progress
 from koz_jax.rollout import CaseResult
@@ -73,7 +73,7 @@ def _resumed(folder: RunFolder, config: TrainConfig) -> Iterator[Checkpoint]:
     """A run to go on with, locked."""
     if not folder.config.is_file():
         raise UserError(f"resume: {folder.path} is not a run folder (it has no {folder.config.name})")
-    with RunLock(folder.path):
+    with FolderLock(folder.path):
         template = _template(config)
         memory.check(config, template.train.buffer, template)
         yield load_checkpoint(folder, config, template)

@@ -27,7 +27,7 @@ from koz_jax.agent import load_agent
 from koz_jax.config import TrainConfig
 from koz_jax.errors import UserError
 from koz_jax.interrupt import StopRequest
-from koz_jax.lock import RunLock
+from koz_jax.lock import FolderLock
 from koz_jax.metrics_log import MetricsLog, read_metrics
 from koz_jax.progress import Progress
 from koz_jax.reward import PAPER_WEIGHTS
@@ -472,8 +472,8 @@ def test_the_last_write_is_awaited_and_its_error_shown(tmp_path, monkeypatch):
 
 def test_two_trainers_do_not_share_a_folder(copied, no_compute):
     before = tiny.contents(copied.path)
-    with RunLock(copied.path):
-        with pytest.raises(UserError, match=rf"run: {copied.path} is being trained by .*\(pid {os.getpid()}\)"):
+    with FolderLock(copied.path):
+        with pytest.raises(UserError, match=rf"run: {copied.path} is in use by .*\(pid {os.getpid()}\)"):
             train(CONFIG, copied.path, resume=True, progress=False)
     assert tiny.contents(copied.path).keys() == before.keys()
     assert train(CONFIG, copied.path, resume=True, progress=False) is not None
@@ -481,18 +481,18 @@ def test_two_trainers_do_not_share_a_folder(copied, no_compute):
 
 def test_a_killed_process_gives_its_lock_up(tmp_path):
     code = (
-        "import os, pathlib, signal; from koz_jax.lock import RunLock\n"
-        f"held = RunLock(pathlib.Path({str(tmp_path)!r}))\n"
+        "import os, pathlib, signal; from koz_jax.lock import FolderLock\n"
+        f"held = FolderLock(pathlib.Path({str(tmp_path)!r}))\n"
         "print('held', flush=True); signal.pause()"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, cwd=tiny.ROOT) as process:
         assert process.stdout is not None
         process.stdout.readline()
-        with pytest.raises(UserError, match=f"being trained by another process .pid {process.pid}"):
-            RunLock(tmp_path)
+        with pytest.raises(UserError, match=f"in use by another process .pid {process.pid}"):
+            FolderLock(tmp_path)
         process.kill()
         process.wait()
-    with RunLock(tmp_path):
+    with FolderLock(tmp_path):
         pass
 
 
