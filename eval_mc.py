@@ -28,6 +28,8 @@ class EvalArgs(FlightArgs):
     """Write the results as JSON."""
     csv: Path | None = None
     """Write a row per case."""
+    partial: Path | None = None
+    """Keep finished blocks of cases in this folder; the same command goes on from them when it was interrupted."""
     figures: Path | None = None
     """Draw the Monte Carlo figures into this folder, as PNG and PDF (needs the extra viz)."""
     replay_case: int | None = None
@@ -71,7 +73,7 @@ def _check_outputs(args: EvalArgs) -> None:
         if args.history is not None:
             raise UserError(f"history: is written by --replay-case only, got {args.history} without it")
     else:
-        for name, path in outputs.items():
+        for name, path in {**outputs, "partial": args.partial}.items():
             if path is not None:
                 raise UserError(f"{name}: is not written with --replay-case, which writes --history; got {path}")
         if args.figures is not None:
@@ -101,10 +103,10 @@ def _replay(pilot: Pilot, task: TaskConfig, config: MonteCarloConfig, case: int,
 
 
 def _monte_carlo(pilot: Pilot, task: TaskConfig, config: MonteCarloConfig, args: EvalArgs) -> None:
-    from koz_jax import evaluation, storage, tables
+    from koz_jax import blocks, evaluation, storage, tables
     from koz_jax.summary import summarise, table
 
-    flown = evaluation.run_cases(pilot, task, config)
+    flown = blocks.run_cases(pilot, task, config, partial=args.partial)
     summary = summarise(flown.results)
     print(table(summary, config.cases, args.name, args.shield))
     print(f"compiled in {flown.compile_s:.1f} s, flown in {flown.wall_s:.1f} s")

@@ -12,6 +12,11 @@ class UserError(ValueError):
     """Something the user gave cannot be used; the message names it, its value, and what is allowed."""
 
 
+def warn(text: str) -> None:
+    """Say on stderr what went wrong without ending the work."""
+    print(f"warning: {text}", file=sys.stderr, flush=True)
+
+
 def explain(error: ValidationError) -> str:
     """One line per bad setting: its name, what is wrong, and the value given."""
     lines = []

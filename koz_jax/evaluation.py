@@ -46,9 +46,11 @@ class MonteCarloConfig:
     substeps: int = 1  # the zone is checked at so many instants per time step
     shield: ShieldConfig | None = None  # None flies without
     uncertainty: UncertaintyConfig | None = None  # None flies the model itself
+    first: int = 0  # index of the first case
 
     def __post_init__(self) -> None:
         _require(0 < self.cases < 2**31, "cases", self.cases, "from 1 to 2^31 - 1")
+        _require(0 <= self.first < 2**31 - self.cases + 1, "first", self.first, "from 0 to 2^31 - cases")
         _require(0 <= self.seed < 2**32, "seed", self.seed, "from 0 to 2^32 - 1")
         _require(0 < self.substeps <= 100, "substeps", self.substeps, "from 1 to 100")
         _require(0 <= self.min_angle_deg <= 180, "min_angle_deg", self.min_angle_deg, "in [0, 180]")
@@ -175,12 +177,16 @@ def _arguments(
     """Traced and static arguments of ``_fly_cases``."""
     check_feasible(task_config, config.max_angle_deg)
     devices = jax.local_devices()[: config.cases]
-    # Every device flies equally many cases; the surplus is flown and dropped.
-    padded = -(-config.cases // len(devices)) * len(devices)
+    # Every device flies equally many cases, in whole chunks where there is more than one: in a chunk of another size
+    # numbers are rounded differently.  The surplus is flown and dropped.
+    share = -(-config.cases // len(devices))
+    if share > _CHUNK or config.first:
+        share = -(-share // _CHUNK) * _CHUNK
+    padded = share * len(devices)
     traced = (
         _flight(controller, task_config, config),
         _draw(task_config, config),
-        jnp.arange(padded, dtype=jnp.int32),
+        config.first + jnp.arange(padded, dtype=jnp.int32),
     )
     return traced, {"mesh": Mesh(np.array(devices), ("cases",))}
 
@@ -193,6 +199,13 @@ def fly_cases(controller: Controller, task_config: TaskConfig, config: MonteCarl
     """Fly all cases on all local devices.  Returns NumPy leaves (cases,)."""
     traced, static = _arguments(controller, task_config, config)
     return _to_host(_fly_cases(*traced, **static), config.cases)
+
+
+def result_shapes(controller: Controller, task_config: TaskConfig, config: MonteCarloConfig) -> CaseResult:
+    """Shapes and types of what ``fly_cases`` returns, without flying."""
+    traced, static = _arguments(controller, task_config, config)
+    shapes = jax.eval_shape(functools.partial(_fly_cases, **static), *traced)
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((config.cases,), leaf.dtype), shapes)
 
 
 def run_cases(agent: Pilot, task_config: TaskConfig, config: MonteCarloConfig) -> MonteCarlo:

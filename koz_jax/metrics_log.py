@@ -10,6 +10,7 @@ import jax
 from tensorboardX import SummaryWriter
 
 from koz_jax import storage
+from koz_jax.errors import UserError
 
 
 def flatten(prefix: str, tree: Any) -> dict[str, float]:
@@ -19,46 +20,75 @@ def flatten(prefix: str, tree: Any) -> dict[str, float]:
 
 
 class MetricsLog:
-    """Writes ``metrics.csv`` and TensorBoard events into a run folder."""
+    """Writes ``metrics.csv`` and TensorBoard events into a run folder.
 
-    def __init__(self, folder: Path, resume_at: int) -> None:
-        """Open the log; rows past update ``resume_at`` belong to work that was lost, and are dropped."""
+    ``metrics.csv`` holds nothing that depends on the machine's speed, so that it is the same whenever the run is;
+    times go to TensorBoard and to ``timing.csv``, which keeps the rows of work that was lost and done again.
+    """
+
+    def __init__(self, folder: Path, text: str, resume_at: int) -> None:
+        """Open the log; ``metrics.csv`` begins with ``text``, that of the checkpoint made at update ``resume_at``.
+
+        Raises:
+            UserError: the files cannot be written.
+
+        """
         self._path = folder / "metrics.csv"
-        header, rows = _whole_lines(self._path)
-        kept = [row for row in rows if int(row.split(",")[0]) <= resume_at]
-        self._columns: list[str] = header.split(",") if kept else []
-        if kept:
-            storage.write_text(self._path, "\n".join([header, *kept, ""]))
-        else:
-            self._path.unlink(missing_ok=True)
-        self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=resume_at + 1)
+        self._timing = folder / "timing.csv"
+        self._lines = [text]
+        self._columns: list[str] = text.partition("\n")[0].split(",") if text else []
+        try:
+            if text:
+                storage.write_text(self._path, text)
+            else:
+                self._path.unlink(missing_ok=True)
+            self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=resume_at + 1)
+        except OSError as error:
+            raise UserError(f"{folder}: cannot be written: {error.strerror or error}") from None
 
-    def write(self, done: int, values: Mapping[str, float]) -> None:
-        """Append one row.  The first row of a run names all columns (nan leaves a cell empty), later ones some."""
+    @property
+    def text(self) -> str:
+        """All of ``metrics.csv`` so far."""
+        return "".join(self._lines)
+
+    def write(self, done: int, values: Mapping[str, float], times: Mapping[str, float]) -> None:
+        """Append one row.  The first row of a run names all columns (nan leaves a cell empty), later ones some.
+
+        times: what depends on the machine's speed.
+
+        Raises:
+            UserError: the disk is full, or the file cannot be written for another reason.
+
+        """
         if not self._columns:
             self._columns = ["updates", *values]
-            self._append(self._columns)
+            self._lines.append(_append(self._path, self._columns))
         unknown = values.keys() - self._columns
         if unknown:
             raise KeyError(f"columns of {self._path} do not include {sorted(unknown)}")
         shown = {name: f"{value:.9g}" for name, value in values.items() if math.isfinite(value)}
-        self._append([str(done), *(shown.get(name, "") for name in self._columns[1:])])
-        for name in shown:
-            self._board.add_scalar(name, values[name], done)
-
-    def _append(self, cells: list[str]) -> None:
-        with open(self._path, "a", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerow(cells)
+        self._lines.append(_append(self._path, [str(done), *(shown.get(name, "") for name in self._columns[1:])]))
+        if not self._timing.exists():
+            _append(self._timing, ["updates", *times])
+        _append(self._timing, [str(done), *(f"{value:.4g}" for value in times.values())])
+        for name, value in {**values, **times}.items():
+            if math.isfinite(value):
+                self._board.add_scalar(name, value, done)
 
     def close(self) -> None:
         """Flush the TensorBoard events."""
         self._board.close()
 
 
-def _whole_lines(path: Path) -> tuple[str, list[str]]:
-    """Header and rows of a ``metrics.csv``; a last line without its end was cut by a crash, and is left out."""
-    lines = path.read_text(encoding="utf-8").split("\n")[:-1] if path.exists() else []
-    return (lines[0], lines[1:]) if lines else ("", [])
+def _append(path: Path, cells: list[str]) -> str:
+    """Add a line to a file.  Returns it."""
+    line = ",".join(cells) + "\n"
+    try:
+        with open(path, "a", encoding="utf-8", newline="") as file:
+            file.write(line)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror or error}") from None
+    return line
 
 
 def read_metrics(path: Path) -> list[dict[str, str]]:

@@ -40,6 +40,10 @@ class Progress:
         if not self._bar.disable:
             self._bar.write(text, file=sys.stderr)
 
+    def warn(self, text: str) -> None:
+        """Print a warning above the bar; also when there is none."""
+        self._bar.write(f"warning: {text}", file=sys.stderr)
+
     def compiling(self) -> None:
         """Say that the first chunk has to be compiled."""
         self._bar.set_description("compiling (seconds the first time, cached afterwards)")

@@ -1,16 +1,20 @@
-"""Layout of a run folder, and the checkpoint of a whole training state.
+"""Layout of a run folder, and the checkpoints of a whole training state.
 
-- ``config.json``: resolved configuration
-- ``metrics.csv``: training curves; ``tensorboard/`` has the same
-- ``checkpoint/``: newest whole training state, replay buffer included
+- ``config.json``: resolved configuration; written last when a run begins, so what has one has a checkpoint too
+- ``metrics.csv``: training curves; ``tensorboard/`` has the same, and ``timing.csv`` what depends on the machine
+- ``checkpoints/``: the two newest whole training states, replay buffer included, named by the updates done; a third is
+  there while it is being written
+- ``lock``: held by the process that trains
 - ``agents/phase1``, ``agents/phase2``: best agent of each phase; ``agents/phase2-sac``: the latter before refinement
 - ``snapshots/phase1``: whole training state at the end of the phase, to start other runs from
 - ``evaluation.json``: Monte Carlo table of the finished run
 """
 
+import contextlib
 import dataclasses
 import os
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +24,13 @@ from pydantic import ValidationError
 
 from koz_jax import storage
 from koz_jax.config import TrainConfig
-from koz_jax.errors import UserError, explain
+from koz_jax.errors import UserError, explain, warn
+from koz_jax.lock import LOCK, FolderLock
 from koz_jax.refine import RefineState
 from koz_jax.sac.learner import LearnerState
 from koz_jax.training import TrainState
+
+KEPT = 2  # checkpoints
 
 
 class RunState(struct.PyTreeNode):
@@ -52,10 +59,22 @@ class RunFolder:
         """Resolved configuration."""
         return self.path / "config.json"
 
-    @property
-    def checkpoint(self) -> Path:
-        """Newest whole training state."""
-        return self.path / "checkpoint"
+    def checkpoint(self, done: int) -> Path:
+        """Whole training state after so many updates and refinement iterations."""
+        return self.path / "checkpoints" / f"{done:010d}"
+
+    def checkpoints(self) -> list[Path]:
+        """All checkpoints, the newest first; also damaged ones."""
+        found = (self.path / "checkpoints").glob("[0-9]*")
+        return sorted((path for path in found if path.name.isdecimal()), key=lambda path: int(path.name), reverse=True)
+
+    def prune(self, newest: int | None = None) -> None:
+        """Remove checkpoints that are older than the last two, and those past ``newest``, which training has left."""
+        kept = [path for path in self.checkpoints() if newest is None or int(path.name) <= newest][:KEPT]
+        unfinished = (self.path / "checkpoints").glob(".*")  # of writes that were killed
+        for path in [*unfinished, *self.checkpoints()]:
+            if path not in kept:
+                shutil.rmtree(path, ignore_errors=True)
 
     @property
     def evaluation(self) -> Path:
@@ -75,21 +94,53 @@ class RunFolder:
         """Whole training state at an intermediate point."""
         return self.path / "snapshots" / name
 
-    def create(self, config: TrainConfig) -> None:
-        """Make the folder of a new run.
+    @contextlib.contextmanager
+    def begin(self) -> Iterator[None]:
+        """Make and lock the folder of a new run, which has begun when ``config.json`` is written.
+
+        On an error before that, nothing is left of it.
 
         Raises:
             UserError: there is something already (nothing is ever overwritten), or the folder cannot be made.
 
         """
         try:
-            if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
+            if self.path.exists() and not (self.path.is_dir() and self._is_unbegun()):
                 raise UserError(
                     f"run: {self.path} exists already; resume it with --resume {self.path}, or choose another folder"
                 )
+            made = [path for path in (self.path, *self.path.parents) if not path.exists()]
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UserError(f"run: {self.path} cannot be created: {error.strerror}") from None
+        try:
+            with FolderLock(self.path):
+                yield from self._begin_locked()
+        finally:
+            for folder in made:
+                with contextlib.suppress(OSError):  # it is in use, as it should be
+                    folder.rmdir()
+
+    def _begin_locked(self) -> Iterator[None]:
+        if not self._is_unbegun():  # another trainer came and went
+            raise UserError(f"run: {self.path} exists already; resume it with --resume {self.path}")
+        try:
+            shutil.rmtree(self.path / "checkpoints", ignore_errors=True)  # of a beginning that was killed
+            yield
+        finally:
+            if not self.config.exists():
+                shutil.rmtree(self.path / "checkpoints", ignore_errors=True)
+                (self.path / LOCK).unlink(missing_ok=True)
+
+    def _is_unbegun(self) -> bool:
+        """Whether the folder is empty, or holds only what a killed beginning left."""
+        first = self.checkpoint(0)
+        left_over = {LOCK, first.parent.name, first.name, f".{first.name}.new"}
+        places = [self.path, *([first.parent] if first.parent.is_dir() else [])]
+        return all(path.name in left_over for place in places for path in place.iterdir())
+
+    def write_config(self, config: TrainConfig) -> None:
+        """Write the configuration of a run that has begun."""
         storage.write_text(self.config, config.model_dump_json(indent=2) + "\n")
 
     def read_config(self) -> TrainConfig:
@@ -102,48 +153,72 @@ class RunFolder:
             raise UserError(f"{self.config}: {explain(error)}") from None
 
 
-def save_state(folder: Path, state: RunState, config: TrainConfig) -> None:
-    """Write a whole training state, replacing an older one in one rename."""
-    record = {"done": state.done, "config": config.model_dump()}
-    storage.save_tree(folder, state, record)
+def record_of(state: RunState, config: TrainConfig, log: str = "") -> dict[str, Any]:
+    """Make what is saved beside a state.  log: ``metrics.csv`` so far."""
+    return {"done": state.done, "config": config.model_dump(), "log": log}
 
 
-def load_checkpoint(folder: RunFolder, config: TrainConfig, template: RunState) -> RunState:
-    """Read the newest training state of a run.
+@dataclasses.dataclass(frozen=True)
+class Checkpoint:
+    """What a run goes on from."""
+
+    state: RunState
+    log: str  # metrics.csv up to the state
+
+
+@dataclasses.dataclass(frozen=True)
+class _Change:
+    """A setting in which a run differs from a saved one."""
+
+    name: str
+    saved: Any
+    given: Any
+
+
+def load_checkpoint(folder: RunFolder, config: TrainConfig, template: RunState) -> Checkpoint:
+    """Read the newest good training state of a run; newer ones that are damaged are named on stderr and left out.
 
     Raises:
         UserError: there is none, or it was made with other settings than ``config``.
 
     """
-    if not storage.is_saved(folder.checkpoint):
+
+    def refuse(path: Path, changes: list[_Change]) -> None:
+        for change in changes:
+            raise UserError(
+                f"resume: {change.name} is {change.given}, but {folder.path} was begun with {change.saved}; a run keeps"
+                f" its settings (undo the change in {folder.config.name}, or begin another run)"
+            )
+
+    found = folder.checkpoints()
+    if not found:
         raise UserError(
             f"resume: {folder.path} has no checkpoint to go on from; begin again with --run and a new folder"
         )
-    for name, saved, given in _changes(folder.checkpoint, config):
-        raise UserError(
-            f"resume: {name} is {given}, but {folder.path} was begun with {saved}; a run keeps its settings (undo the"
-            f" change in {folder.config.name}, or begin another run)"
-        )
-    return storage.load_tree(folder.checkpoint, template)
+    path, state = _newest_good(found, config, template, refuse)
+    return Checkpoint(state, str(storage.read_record(path).get("log", "")))
 
 
 def load_source(folder: Path, config: TrainConfig, template: RunState) -> RunState:
-    """Read a snapshot, or the checkpoint of a run, for another run with ``config`` to begin from.
+    """Read a snapshot, or the newest good checkpoint of a run, for another run with ``config`` to begin from.
 
     Raises:
         UserError: it is neither, or its networks or its replay buffer do not fit.
 
     """
-    source = next((path for path in (folder / "checkpoint", folder) if storage.is_saved(path)), None)
-    if source is None:
+
+    def refuse(path: Path, changes: list[_Change]) -> None:
+        for change in changes:
+            if change.name.startswith(_SIZES):
+                raise UserError(
+                    f"start_from: {change.name} must be {change.saved}, as in {path}, so that its networks and its"
+                    f" replay buffer fit; got {change.given}"
+                )
+
+    sources = RunFolder(folder).checkpoints() or [folder]
+    if not any(map(storage.is_saved, sources)):
         raise UserError(f"start_from: {folder} is neither a run with a checkpoint nor a snapshot")
-    for name, saved, given in _changes(source, config):
-        if name.startswith(_SIZES):
-            raise UserError(
-                f"start_from: {name} must be {saved}, as in {folder}, so that its networks and its replay buffer fit;"
-                f" got {given}"
-            )
-    state = storage.load_tree(source, template)
+    _, state = _newest_good(sources, config, template, refuse)
     if state.train.buffer.size < config.sac.n_step:
         raise UserError(
             f"sac.n_step: must be at most the {state.train.buffer.size} steps in the replay buffer of {folder}, got"
@@ -152,12 +227,38 @@ def load_source(folder: Path, config: TrainConfig, template: RunState) -> RunSta
     return state
 
 
+def _newest_good(
+    paths: list[Path], config: TrainConfig, template: RunState, refuse: Callable[[Path, list[_Change]], None]
+) -> tuple[Path, RunState]:
+    """Load the first state that is undamaged, and warn of those before it.
+
+    refuse: raises UserError where a state was saved with settings that do not do.
+    """
+    problems = []
+    for path in paths:
+        try:
+            changes = _changes(path, config)
+        except UserError as damage:
+            problems.append(str(damage))
+            continue
+        refuse(path, changes)
+        try:
+            state = storage.load_tree(path, template)
+        except UserError as damage:
+            problems.append(str(damage))
+            continue
+        for problem in problems:
+            warn(f"{problem}; going on from {path} instead")
+        return path, state
+    raise UserError("\n".join(problems))
+
+
 # Settings (by the beginning of their name) that decide the shapes of a learner and a replay buffer.
 _SIZES = ("network.", "num_envs", "sac.buffer_size")
 
 
-def _changes(folder: Path, config: TrainConfig) -> Iterator[tuple[str, Any, Any]]:
-    """Settings in which ``config`` differs from those a state was saved with: name, saved value, given value."""
+def _changes(folder: Path, config: TrainConfig) -> list[_Change]:
+    """Settings in which ``config`` differs from those a state was saved with."""
     record = storage.read_record(folder)
     if "config" not in record:
         raise UserError(f"{folder}: holds an agent alone, not a training state")
@@ -166,4 +267,4 @@ def _changes(folder: Path, config: TrainConfig) -> Iterator[tuple[str, Any, Any]
     except ValidationError as error:
         raise UserError(f"{folder / 'record.json'}: {explain(error)}") from None
     before, after = (traverse_util.flatten_dict(settings.model_dump(), sep=".") for settings in (saved, config))
-    return ((name, before[name], after[name]) for name in before if before[name] != after[name])
+    return [_Change(name, before[name], after[name]) for name in before if before[name] != after[name]]

@@ -17,7 +17,8 @@ import numpy as np
 
 from koz_jax.errors import UserError
 
-FORMAT = 1
+FORMAT = 2
+_OLD_FORMAT = 1  # its records have no checksum
 
 _FILES = {"arrays.npz", "record.json"}
 
@@ -91,7 +92,7 @@ def read_json(path: Path) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise UserError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{path}: cannot be read as JSON: {error}") from None
     if not isinstance(content, dict):
         raise UserError(f"{path}: must hold a JSON object, got {type(content).__name__}")
@@ -101,12 +102,18 @@ def read_json(path: Path) -> dict[str, Any]:
 def save_tree(folder: Path, tree: Any, record: Mapping[str, Any]) -> None:
     """Write a pytree and a JSON record as a folder, replacing an older one only when the new one is whole.
 
-    The folder holds ``arrays.npz`` and ``record.json``; the record gains the format number and the arrays' checksum.
+    The folder holds ``arrays.npz`` and ``record.json``; the record gains the format number, the arrays' checksum and
+    its own.
 
     Raises:
         UserError: the folder cannot be written, or holds something else that would be lost.
 
     """
+    save_arrays(folder, to_arrays(tree), record)
+
+
+def save_arrays(folder: Path, arrays: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> None:
+    """``save_tree`` for a tree that is on the host already (see ``to_arrays``)."""
     fresh, old = _sibling(folder, "new"), _sibling(folder, "old")
     try:
         if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - _FILES):
@@ -119,11 +126,11 @@ def save_tree(folder: Path, tree: Any, record: Mapping[str, Any]) -> None:
             shutil.rmtree(left_over, ignore_errors=True)
         fresh.mkdir(parents=True)
         with open(fresh / "arrays.npz", "wb") as file:
-            np.savez(file, allow_pickle=False, **_to_arrays(tree))
+            np.savez(file, allow_pickle=False, **arrays)
             file.flush()
             os.fsync(file.fileno())
         digest = _sha256(fresh / "arrays.npz")
-        write_json(fresh / "record.json", {"format": FORMAT, **record, "arrays_sha256": digest})
+        write_json(fresh / "record.json", _signed({"format": FORMAT, **record, "arrays_sha256": digest}))
         _put_in_place(fresh, folder, old)
     except OSError as error:
         raise UserError(f"{folder}: cannot be written: {error.strerror or error}") from error
@@ -140,7 +147,25 @@ def _put_in_place(fresh: Path, folder: Path, old: Path) -> None:
         if old.exists():
             os.replace(old, folder)
         raise
+    _sync(folder.parent)
     shutil.rmtree(old, ignore_errors=True)
+
+
+def _sync(folder: Path) -> None:
+    """Make renames inside a folder last through a power cut; a system that cannot do so for folders is let off."""
+    with contextlib.suppress(OSError):
+        entries = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(entries)
+        finally:
+            os.close(entries)
+
+
+def _signed(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Add to a record the checksum of its content, which does not depend on how the JSON is laid out."""
+    content = {name: value for name, value in record.items() if name != "record_sha256"}
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return {**content, "record_sha256": hashlib.sha256(text.encode()).hexdigest()}
 
 
 def _sibling(folder: Path, state: str) -> Path:
@@ -159,11 +184,14 @@ def is_saved(folder: Path) -> bool:
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Read the JSON record of a saved folder and check its format."""
+    """Read the JSON record of a saved folder, and check its format and its checksum."""
     path = _whole(folder) / "record.json"
     record = read_json(path)
-    if record.get("format") != FORMAT:
-        raise UserError(f"{path}: format must be {FORMAT}, got {record.get('format')!r}")
+    found = record.get("format")
+    if type(found) is not int or found not in (_OLD_FORMAT, FORMAT):
+        raise UserError(f"{path}: format must be {FORMAT} (or {_OLD_FORMAT}, the older one), got {found!r}")
+    if (found == FORMAT or "record_sha256" in record) and _signed(record) != record:
+        raise UserError(f"{path}: damaged: its content does not have the checksum written in it")
     return record
 
 
@@ -198,7 +226,7 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
         raise UserError(f"{path}: cannot be read as arrays: {error}") from None
 
 
-def _named_leaves(tree: Any) -> dict[str, Any]:
+def named_leaves(tree: Any) -> dict[str, Any]:
     """Leaves by their path in the tree, such as ``learner/policy/params/kernel``."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
@@ -208,16 +236,21 @@ def _is_key(leaf: Any) -> bool:
     return hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
-def _to_arrays(tree: Any) -> dict[str, np.ndarray]:
-    """Arrays to store by name; typed PRNG keys as their data."""
-    return {
-        name: np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
-        for name, leaf in _named_leaves(tree).items()
-    }
+def key_data(tree: Any) -> Any:
+    """Replace typed PRNG keys by their data."""
+    return jax.tree.map(lambda leaf: jax.random.key_data(leaf) if _is_key(leaf) else leaf, tree)
+
+
+def to_arrays(tree: Any) -> dict[str, np.ndarray]:
+    """Copy a tree to the host: arrays by name, typed PRNG keys as their data.
+
+    A view would not do: the memory of a state is used again as soon as training goes on.
+    """
+    return {name: np.array(leaf) for name, leaf in named_leaves(key_data(tree)).items()}
 
 
 def _from_arrays(arrays: dict[str, np.ndarray], template: Any, path: Path) -> Any:
-    wanted = _named_leaves(template)
+    wanted = named_leaves(template)
     if wanted.keys() != arrays.keys():
         missing, extra = sorted(wanted.keys() - arrays.keys()), sorted(arrays.keys() - wanted.keys())
         raise UserError(f"{path}: holds other arrays than expected: missing {missing[:3]}, unexpected {extra[:3]}")

@@ -1,10 +1,12 @@
 """The host loop of training: chunks, evaluation, best agents, checkpoints, logs, interrupts."""
 
+import contextlib
 import math
 import shlex
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -12,19 +14,21 @@ import jax.numpy as jnp
 import numpy as np
 
 import koz_jax
-from koz_jax import curriculum, evaluation, refine, reward, training
+from koz_jax import curriculum, evaluation, memory, refine, reward, storage, training, watch
 from koz_jax.agent import Agent, PolicyController, Provenance
 from koz_jax.config import TrainConfig
 from koz_jax.errors import UserError
 from koz_jax.evaluation import MonteCarloConfig
 from koz_jax.interrupt import StopRequest
+from koz_jax.lock import FolderLock
 from koz_jax.metrics_log import MetricsLog, flatten
 from koz_jax.progress import Progress
 from koz_jax.rollout import CaseResult
-from koz_jax.run_folder import RunFolder, RunState, load_checkpoint, load_source, save_state
+from koz_jax.run_folder import Checkpoint, RunFolder, RunState, load_checkpoint, load_source, record_of
 from koz_jax.sac import replay
 from koz_jax.summary import Summary, summarise
 from koz_jax.training import TrainState
+from koz_jax.writer import Writer
 
 # Evaluation scenarios during training: the same for every run, and drawn from a seed that people do not type.
 _EVAL_SEED = 2_718_281_828
@@ -57,17 +61,51 @@ def train(
     if resume and start_from is not None:
         raise UserError(f"start_from: a resumed run goes on from its own checkpoint, got {start_from}")
     folder = RunFolder(Path(run))
-    with StopRequest() as stop:
-        if resume:
-            state = load_checkpoint(folder, config, _template(config))
-        else:
-            evaluation.check_feasible(config.task, config.eval_max_angle_deg, "eval_max_angle_deg")
-            source = None if start_from is None else load_source(Path(start_from), config, _template(config))
-            folder.create(config)
-            state = _begin(config, source)
-        with Progress(config, state.done, enabled=progress) as bar:
+    with StopRequest() as stop, _resumed(folder, config) if resume else _begun(folder, config, start_from) as saved:
+        with Progress(config, saved.state.done, enabled=progress) as bar:
             bar.note(f"run folder: {folder.path}")
-            return _Run(config, folder, bar, stop).go(state)
+            with _memory_errors():
+                return _Run(config, folder, bar, stop).go(saved)
+
+
+@contextlib.contextmanager
+def _resumed(folder: RunFolder, config: TrainConfig) -> Iterator[Checkpoint]:
+    """A run to go on with, locked."""
+    if not folder.config.is_file():
+        raise UserError(f"resume: {folder.path} is not a run folder (it has no {folder.config.name})")
+    with FolderLock(folder.path):
+        template = _template(config)
+        memory.check(config, template.train.buffer, template)
+        yield load_checkpoint(folder, config, template)
+
+
+@contextlib.contextmanager
+def _begun(folder: RunFolder, config: TrainConfig, start_from: Path | str | None) -> Iterator[Checkpoint]:
+    """A new run, locked, with its first checkpoint; on an error before that nothing is left of it."""
+    evaluation.check_feasible(config.task, config.eval_max_angle_deg, "eval_max_angle_deg")
+    with folder.begin():
+        template = _template(config)
+        memory.check(config, template.train.buffer, template)
+        source = None if start_from is None else load_source(Path(start_from), config, template)
+        with _memory_errors():
+            state = _begin(config, source)
+        storage.save_tree(folder.checkpoint(0), state, record_of(state, config))
+        folder.write_config(config)
+        yield Checkpoint(state, "")
+
+
+@contextlib.contextmanager
+def _memory_errors() -> Iterator[None]:
+    """Say it in one line when a device runs out of memory."""
+    try:
+        yield
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error) and "Out of memory" not in str(error):
+            raise
+        raise UserError(
+            "out of memory: make num_envs, sac.buffer_size, sac.batch_size, network.hidden_sizes, eval_cases or"
+            f" refine.scenarios smaller; {str(error).splitlines()[0]}"
+        ) from None
 
 
 def _template(config: TrainConfig) -> RunState:
@@ -114,6 +152,8 @@ class _Run:
         self.folder = folder
         self.bar = bar
         self.stop = stop
+        self.writer = Writer()
+        self.warned = False  # that the critic diverges
         phase1, learned = config.curriculum.phase1.updates, config.curriculum.updates
         self.evaluations = sorted(
             {
@@ -124,37 +164,51 @@ class _Run:
         )
         self.commit = _commit()
 
-    def go(self, state: RunState) -> Agent | None:
+    def go(self, saved: Checkpoint) -> Agent | None:
         """Train to the end, or until asked to stop."""
+        state = saved.state
         if state.done < self.config.length:
-            state = self._train(state)
+            self.folder.prune(state.done)
+            with self.writer:
+                state = self._train(state, saved.log)
         if state.done < self.config.length:
-            save_state(self.folder.checkpoint, state, self.config)
             return None
         return self._agent(state, 2 if self.config.curriculum.phase2.updates else 1)
 
-    def _train(self, state: RunState) -> RunState:
+    def _train(self, state: RunState, logged: str) -> RunState:
         """Go on chunk by chunk; log, evaluate and checkpoint on the way."""
-        log = MetricsLog(self.folder.path, state.done)
+        log = MetricsLog(self.folder.path, logged, state.done)
         self.bar.compiling()
         # The first row of a log names its columns.
         blank = dict.fromkeys(("refine/cost", *_EVAL_NAMES), math.nan)
+        saved_at = state.done
         try:
             while state.done < self.config.length and not self.stop.requested:
                 learning = state.done < self.config.curriculum.updates
+                before, start = state.done, time.perf_counter()
                 state, measured = self._learn(state) if learning else self._refine(state)
+                speed = {"updates_per_second": (state.done - before) / (time.perf_counter() - start)}
                 values = measured | blank | measured  # what is measured stands first, and is not blanked
                 blank = {}
+                self.writer.check()
                 self.bar.advance(state.done)
                 if state.done in self.evaluations:
                     state, evaluated = self._evaluate(state)
-                    log.write(state.done, values | evaluated)
-                    save_state(self.folder.checkpoint, state, self.config)
+                    log.write(state.done, values | evaluated, speed)
+                    self._checkpoint(state, log)
+                    saved_at = state.done
                 else:
-                    log.write(state.done, values)
+                    log.write(state.done, values, speed)
+            if saved_at < state.done:
+                self._checkpoint(state, log)
         finally:
             log.close()
         return state
+
+    def _checkpoint(self, state: RunState, log: MetricsLog) -> None:
+        """Begin to write a checkpoint; those before the last two go when it is whole."""
+        record = record_of(state, self.config, log.text)
+        self.writer.save(self.folder.checkpoint(state.done), state, record, self.folder.prune)
 
     def _chunk_end(self, done: int, log_every: int) -> int:
         """Where the next chunk ends: at the next line of the log or the next evaluation."""
@@ -166,14 +220,16 @@ class _Run:
         done = state.done
         end = self._chunk_end(done, self.config.log_every)
         steps = (end - done) // self.config.updates_per_step
-        start = time.perf_counter()
         train_state, metrics = training.train_chunk(self.config, state.train, jnp.int32(steps))
         metrics = jax.device_get(metrics)
-        seconds = time.perf_counter() - start
+        watch.check(end, int(metrics.fault), {"learner": train_state.learner, "environments": train_state.env_states})
+        warning = watch.divergence(self.config, metrics.learner)
+        if warning is not None and not self.warned:
+            self.bar.warn(f"update {end}: {warning}")
+            self.warned = True
         at = curriculum.difficulty(self.config.curriculum, jnp.int32(end))
         values = {
             "env_steps": (self.config.prefill_steps + end // self.config.updates_per_step) * self.config.num_envs,
-            "updates_per_second": (end - done) / seconds,
             **flatten("train", metrics.learner),
             **flatten("reward", metrics.reward),
             **flatten("curriculum", jax.device_get(at)),
@@ -184,10 +240,9 @@ class _Run:
         """One chunk of refinement."""
         done = state.done
         end = self._chunk_end(done, self.config.refine_log_every)
-        start = time.perf_counter()
         refined, cost = refine.refine_chunk(self.config, state.refine, jnp.int32(end - done))
-        values = {"refine/cost": float(cost), "updates_per_second": (end - done) / (time.perf_counter() - start)}
-        return state.replace(refine=refined), values
+        watch.check(end, watch.SOUND, {"refine/cost": cost, "refine/state": refined})
+        return state.replace(refine=refined), {"refine/cost": float(cost)}
 
     def _evaluate(self, state: RunState) -> tuple[RunState, dict[str, float]]:
         """Judge the policy, keep the best, and at the end of a stage hand it on."""
@@ -205,13 +260,14 @@ class _Run:
         controller = PolicyController(learner.averaged_policy, self.config.network)
         results = evaluation.fly_cases(controller, self.config.task, cases)
         found, summary = score(results, self.config, phase), summarise(results)
+        watch.check(done, watch.SOUND, {"eval/score": jnp.float32(found)})
         self.bar.evaluated(summary)
         if found > float(state.best_score):
             best = jax.tree.map(jnp.copy, learner)
             state = state.replace(best=best, best_score=jnp.float32(found), best_at=jnp.int32(done))
             self._agent(state, phase).save(self.folder.agent(phase))
         if done == curriculum_config.phase1.updates:
-            save_state(self.folder.snapshot("phase1"), state, self.config)
+            self.writer.save(self.folder.snapshot("phase1"), state, record_of(state, self.config))
             if curriculum_config.phase2.updates:
                 learner = jax.tree.map(jnp.copy, state.best)
                 state = _fresh(self.config, state.train.replace(learner=learner))

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from koz_jax import curriculum, env, observation, reward, scenario, shield, task
+from koz_jax import curriculum, env, observation, reward, scenario, shield, task, watch
 from koz_jax.config import TrainConfig
 from koz_jax.curriculum import Difficulty
 from koz_jax.env import EnvParams, EnvState
@@ -43,6 +43,7 @@ class TrainMetrics(struct.PyTreeNode):
 
     learner: LearnerMetrics
     reward: RewardTerms  # per environment step, unweighted
+    fault: jax.Array  # () int32, the first term that was not finite (see ``watch``)
 
 
 def make_sac(config: TrainConfig) -> Sac:
@@ -199,8 +200,11 @@ def train_step(config: TrainConfig, params: EnvParams, state: TrainState) -> tup
     keys = jax.random.split(key_updates, config.updates_per_step)
     learner, learner_metrics = jax.lax.scan(learn, state.learner, (batches, keys))
     terms = reward.terms(transition.outcome, params.reward, params.spacecraft.torque_limit)
+    networks = (state.learner.policy, state.learner.critic, state.learner.log_alpha)
+    fault = watch.first_fault(watch.Watched(networks, observed, terms, drawn.reward, learner_metrics))
     state = TrainState(learner, buffer, env_states, key, state.updates + config.updates_per_step)
-    return state, jax.tree.map(jnp.mean, TrainMetrics(learner_metrics, terms))
+    learned, rewarded = jax.tree.map(jnp.mean, (learner_metrics, terms))
+    return state, TrainMetrics(learned, rewarded, fault)
 
 
 @functools.partial(jax.jit, static_argnames="config", donate_argnames="state")
@@ -211,9 +215,11 @@ def train_chunk(config: TrainConfig, state: TrainState, steps: jax.Array) -> tup
     def body(_: jax.Array, carry: tuple[TrainState, TrainMetrics]) -> tuple[TrainState, TrainMetrics]:
         state, sums = carry
         state, metrics = train_step(config, params, state)
-        return state, jax.tree.map(jnp.add, sums, metrics)
+        first = jnp.where(sums.fault == watch.SOUND, metrics.fault, sums.fault)
+        return state, jax.tree.map(jnp.add, sums, metrics).replace(fault=first)
 
     shapes = jax.eval_shape(lambda s: train_step(config, params, s)[1], state)
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    zeros = zeros.replace(fault=jnp.int32(watch.SOUND))
     state, sums = jax.lax.fori_loop(0, steps, body, (state, zeros))
-    return state, jax.tree.map(lambda total: total / steps, sums)
+    return state, jax.tree.map(lambda total: total / steps, sums).replace(fault=sums.fault)

@@ -10,7 +10,7 @@ import pytest
 import tiny
 
 import koz_jax.agent
-from koz_jax import observation
+from koz_jax import observation, storage
 from koz_jax.agent import Agent, find_agent, load_agent, shipped_agents
 from koz_jax.errors import UserError
 from koz_jax.run_folder import RunFolder
@@ -50,7 +50,7 @@ def tamper(folder, change) -> None:
     """Change the record of a saved folder."""
     record = json.loads((folder / "record.json").read_text())
     change(record)
-    (folder / "record.json").write_text(json.dumps(record))
+    (folder / "record.json").write_text(json.dumps(storage._signed(record)))
 
 
 def test_predict_takes_one_observation_or_a_batch(agent):
@@ -102,7 +102,7 @@ def test_a_run_stands_for_its_latest_phase(run, tmp_path):
 
 def test_a_snapshot_is_no_agent(run):
     # It holds the learner and the buffer, to train on from; --start-from takes it.
-    for folder in (run.snapshot("phase1"), run.checkpoint):
+    for folder in (run.snapshot("phase1"), run.checkpoints()[0]):
         with pytest.raises(UserError, match="neither a shipped agent"):
             load_agent(folder)
 
@@ -140,7 +140,7 @@ def test_what_is_no_agent_is_refused(name, monkeypatch, tmp_path):
         (lambda record: record["network"].update(hidden_sizes=[0]), "network.hidden_sizes.0: Input should be greater"),
         (lambda record: record["network"].update(hidden_sizes=[16, 17]), "must be float32(17,), got float32(16,)"),
         (lambda record: record["network"].update(hidden_sizes=[16]), "holds other arrays than expected"),
-        (lambda record: record.update(format=7), "format must be 1, got 7"),
+        (lambda record: record.update(format=7), "format must be 2 (or 1, the older one), got 7"),
     ],
 )
 def test_a_tampered_agent_is_refused(saved, change, reason):

@@ -131,6 +131,10 @@ def adam(params, gradient, optimizer, rate):
     return stepped, optax.ScaleByAdamState(np.array(count), mu, nu)
 
 
+def norm(tree):
+    return np.sqrt(sum(np.sum(leaf**2) for leaf in jax.tree.leaves(tree)))
+
+
 def as_float64(tree):
     return jax.tree.map(lambda x: np.array(x, np.float64), tree)
 
@@ -154,13 +158,15 @@ def reference_update(learner, batch, key, rate):
     def critic_loss(critic):
         return sum(0.5 * np.mean((q - target) ** 2) for q in values(critic, batch.observation, batch.action))
 
-    critic, critic_optimizer = adam(old.critic, slopes(critic_loss, old.critic), old.critic_optimizer, rate)
+    critic_gradient = slopes(critic_loss, old.critic)
+    critic, critic_optimizer = adam(old.critic, critic_gradient, old.critic_optimizer, rate)
 
     def actor_loss(policy):
         action, log_prob = act(policy, batch.observation, noise)
         return np.mean(alpha * log_prob - values(critic, batch.observation, action).min(axis=0))
 
-    policy, policy_optimizer = adam(old.policy, slopes(actor_loss, old.policy), old.policy_optimizer, rate)
+    policy_gradient = slopes(actor_loss, old.policy)
+    policy, policy_optimizer = adam(old.policy, policy_gradient, old.policy_optimizer, rate)
 
     def average(share, new, before):
         return jax.tree.map(lambda n, b: share * n + (1 - share) * b, new, before)
@@ -181,6 +187,8 @@ def reference_update(learner, batch, key, rate):
         "alpha": alpha,
         "entropy": -np.mean(log_prob),
         "q_mean": np.mean(values(old.critic, batch.observation, batch.action)),
+        "critic_gradient": norm(critic_gradient),
+        "policy_gradient": norm(policy_gradient),
     }
 
 

@@ -63,7 +63,7 @@ def replace_arrays(folder: Path, content: bytes) -> None:
     (folder / "arrays.npz").write_bytes(content)
     record = json.loads((folder / "record.json").read_text())
     record["arrays_sha256"] = storage._sha256(folder / "arrays.npz")
-    (folder / "record.json").write_text(json.dumps(record))
+    (folder / "record.json").write_text(json.dumps(storage._signed(record)))
 
 
 def npz(path: Path, **arrays: Any) -> bytes:
@@ -131,6 +131,41 @@ def test_every_flipped_bit_and_truncation_is_noticed(saved):
     storage.load_tree(saved, template(small()))
 
 
+def test_every_flipped_bit_of_the_record_is_noticed_or_changes_nothing(tmp_path):
+    record = {"note": "first", "scale": 1e-05, "sizes": (16, 16), "text": "a,b\n1,0.5\n"}
+    storage.save_tree(tmp_path / "state", small(), record)
+    path = tmp_path / "state" / "record.json"
+    whole, content = path.read_bytes(), storage.read_record(tmp_path / "state")
+    harmless = 0
+    for position in range(len(whole)):
+        for bit in range(8):
+            path.write_bytes(whole[:position] + bytes([whole[position] ^ 1 << bit]) + whole[position + 1 :])
+            try:
+                found = storage.read_record(tmp_path / "state")
+            except UserError as error:
+                assert str(error).startswith(str(path))
+            else:
+                assert found == content  # such as 1E-05 for 1e-05
+                harmless += 1
+    assert harmless <= 2
+
+
+def test_a_record_does_not_depend_on_how_it_is_laid_out(saved):
+    path = saved / "record.json"
+    path.write_text(json.dumps(json.loads(path.read_text())))
+    assert storage.read_record(saved)["note"] == "first"
+
+
+def test_a_record_of_the_format_without_checksum_is_read(saved):
+    path = saved / "record.json"
+    record = json.loads(path.read_text())
+    del record["record_sha256"]
+    path.write_text(json.dumps(record | {"format": 1}))
+    assert_same(storage.load_tree(saved, template(small())), small())
+    path.write_text(json.dumps(record))
+    assert "damaged" in refusal(saved)
+
+
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
@@ -138,8 +173,12 @@ def test_every_flipped_bit_and_truncation_is_noticed(saved):
         ("{", "cannot be read as JSON"),
         ("[" * 100_000, "cannot be read as JSON"),
         ("[1]", "must hold a JSON object, got list"),
-        ("{}", "format must be 1, got None"),
-        ('{"format": 2}', "format must be 1, got 2"),
+        ("1" * 10_000, "cannot be read as JSON"),
+        ("{}", "format must be 2 (or 1, the older one), got None"),
+        ('{"format": 3}', "format must be 2 (or 1, the older one), got 3"),
+        ('{"format": true}', "format must be 2 (or 1, the older one), got True"),
+        ('{"format": 2}', "damaged: its content does not have the checksum written in it"),
+        ('{"format": 1, "record_sha256": ""}', "damaged: its content does not have the checksum written in it"),
         ('{"format": 1}', "checksum"),
     ],
 )

@@ -1,6 +1,7 @@
 """The host loop: what a run leaves behind, and that stopping and going on changes nothing."""
 
 import contextlib
+import csv
 import json
 import math
 import os
@@ -8,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -25,16 +27,14 @@ from koz_jax.agent import load_agent
 from koz_jax.config import TrainConfig
 from koz_jax.errors import UserError
 from koz_jax.interrupt import StopRequest
+from koz_jax.lock import FolderLock
 from koz_jax.metrics_log import MetricsLog, read_metrics
 from koz_jax.progress import Progress
 from koz_jax.reward import PAPER_WEIGHTS
 from koz_jax.rollout import CaseResult
-from koz_jax.run_folder import RunFolder, RunState
+from koz_jax.run_folder import Checkpoint, RunFolder, RunState
 from koz_jax.sac import replay
 from koz_jax.trainer import train
-
-# Columns that measure time.
-TIMES = {"updates_per_second"}
 
 
 @pytest.fixture(scope="module")
@@ -97,18 +97,11 @@ def assert_same_tree(found: Any, expected: Any) -> None:
         np.testing.assert_array_equal(one, other, err_msg=jax.tree_util.keystr(path), strict=True)
 
 
-def assert_same_metrics(found: Path, expected: Path) -> None:
-    rows, others = read_metrics(found), read_metrics(expected)
-    for row, other in zip(rows, others, strict=True):
-        assert row.keys() == other.keys()
-        assert {name: row[name] for name in row.keys() - TIMES} == {name: other[name] for name in row.keys() - TIMES}
-
-
 def assert_same_run(found: RunFolder, expected: RunFolder) -> None:
-    """Same to the last bit, but for times."""
-    assert_same_tree(state_of(found.checkpoint), state_of(expected.checkpoint))
+    """Same to the last bit."""
+    assert_same_tree(state_of(found.checkpoints()[0]), state_of(expected.checkpoints()[0]))
     assert_same_tree(state_of(found.snapshot("phase1")), state_of(expected.snapshot("phase1")))
-    assert_same_metrics(found.path / "metrics.csv", expected.path / "metrics.csv")
+    assert (found.path / "metrics.csv").read_bytes() == (expected.path / "metrics.csv").read_bytes()
     for phase in (1, 2):
         one, other = (load_agent(folder.agent(phase)) for folder in (found, expected))
         assert_same_tree(one.controller, other.controller)
@@ -122,12 +115,15 @@ def test_layout_of_a_run(run):
         ("agents/phase2", "agents"),
         ("agents/phase2-sac", "agents"),
         ("snapshots/phase1", "snapshots"),
-        ("checkpoint", "checkpoint"),
+        ("checkpoints/0000000132", "checkpoints"),
+        ("checkpoints/0000000136", "checkpoints"),
     ]
     assert found == {
         "config.json",
+        "lock",
         "metrics.csv",
         "tensorboard",
+        "timing.csv",
         *(name for names in saved for name in names),
         *(f"{folder}/{name}" for folder, _ in saved for name in ("arrays.npz", "record.json")),
     }
@@ -146,7 +142,11 @@ def test_metrics_have_a_row_per_chunk_and_an_evaluation_where_due(run):
         assert all(np.isfinite(float(row[name])) for name in row if name.startswith(("train/", "reward/")))
         assert row["refine/cost"] == ""
     assert all(float(row["refine/cost"]) > 0 and row["train/critic_loss"] == "" for row in refined)
-    assert {"train/critic_loss", "reward/zone", "curriculum/max_angle", "updates_per_second"} <= rows[0].keys()
+    assert {"train/critic_loss", "reward/zone", "curriculum/max_angle"} <= rows[0].keys()
+    with open(run.path / "timing.csv", newline="") as file:
+        times = list(csv.DictReader(file))
+    assert [row["updates"] for row in times] == [row["updates"] for row in rows]
+    assert all(float(row["updates_per_second"]) > 0 for row in times)
 
 
 def test_metrics_go_to_tensorboard_too(run):
@@ -182,7 +182,7 @@ def test_a_stopped_and_resumed_run_equals_the_undisturbed_one(run, tmp_path, don
     folder = RunFolder(tmp_path / "run")
     with signal_after(done, number):
         assert train(CONFIG, folder.path, progress=False) is None
-    assert state_of(folder.checkpoint).done == done
+    assert state_of(folder.checkpoints()[0]).done == done
     agent = train(CONFIG, folder.path, resume=True, progress=False)
     assert agent is not None
     assert_same_run(folder, run)
@@ -199,24 +199,27 @@ def test_a_run_stopped_twice_equals_the_undisturbed_one(run, tmp_path):
     assert_same_run(folder, run)
 
 
-def test_a_killed_run_goes_on_from_its_last_checkpoint(run, tmp_path, monkeypatch):
+def test_a_killed_run_goes_on_from_its_last_checkpoint(run, tmp_path):
     folder = RunFolder(tmp_path / "run")
 
-    def crash(*_: Any) -> None:
-        raise RuntimeError("power cut")
+    class PowerCutError(Exception):
+        pass
 
-    with signal_after(96, signal.SIGINT), monkeypatch.context() as patch:
-        # Rows 80 and 96 are in the log, but the checkpoint is that of 64.
-        saves = trainer.save_state
+    advance = Progress.advance
 
-        def save(path: Path, state: RunState, config: TrainConfig) -> None:
-            crash() if state.done > 64 else saves(path, state, config)
+    def cut(bar: Progress, at: int) -> None:
+        advance(bar, at)
+        if at == 112:
+            raise PowerCutError
 
-        patch.setattr(trainer, "save_state", save)
-        with pytest.raises(RuntimeError, match="power cut"):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Progress, "advance", cut)
+        with pytest.raises(PowerCutError):
             train(CONFIG, folder.path, progress=False)
-    assert state_of(folder.checkpoint).done == 64
-    assert [row["updates"] for row in read_metrics(folder.path / "metrics.csv")][-1] == "96"
+    # The log goes on beyond the checkpoint, and loses a part as after a crash of the system.
+    assert [path.name for path in folder.checkpoints()] == ["0000000096", "0000000064"]
+    log = folder.path / "metrics.csv"
+    log.write_bytes(log.read_bytes() + b"112,0.1")
     assert train(CONFIG, folder.path, resume=True, progress=False) is not None
     assert_same_run(folder, run)
 
@@ -232,7 +235,7 @@ def test_a_signal_before_the_first_update_makes_a_checkpoint_too(run, tmp_path, 
     with monkeypatch.context() as patch:
         patch.setattr(trainer, "_begin", signalled)
         assert train(CONFIG, folder.path, progress=False) is None
-    assert state_of(folder.checkpoint).done == 0
+    assert state_of(folder.checkpoints()[0]).done == 0
     assert train(CONFIG, folder.path, resume=True, progress=False) is not None
     assert_same_run(folder, run)
 
@@ -269,7 +272,7 @@ def test_the_best_learner_of_phase_1_starts_phase_2(tmp_path, monkeypatch):
     folder = RunFolder(tmp_path / "run")
     with signal_after(64, signal.SIGINT):
         assert train(CONFIG, folder.path, progress=False) is None
-    snapshot, begun = state_of(folder.snapshot("phase1")), state_of(folder.checkpoint)
+    snapshot, begun = state_of(folder.snapshot("phase1")), state_of(folder.checkpoints()[0])
     assert (float(snapshot.best_score), int(snapshot.best_at)) == (2.0, 32)
     assert_same_tree(begun.train.learner, snapshot.best)
     assert not np.array_equal(begun.train.learner.log_alpha, snapshot.train.learner.log_alpha)
@@ -286,7 +289,7 @@ def test_refinement_begins_with_the_best_of_phase_2_and_the_best_of_all_is_retur
     folder = RunFolder(tmp_path / "run")
     with signal_after(tiny.LEARNED, signal.SIGINT):
         assert train(CONFIG, folder.path, progress=False) is None
-    begun = state_of(folder.checkpoint)
+    begun = state_of(folder.checkpoints()[0])
     assert int(begun.best_at) == 96
     assert_same_tree(begun.refine.policy, begun.best.averaged_policy)
     assert_same_tree(begun.refine.policy, load_agent(folder.sac_agent).controller.policy)
@@ -333,12 +336,8 @@ def test_a_used_folder_is_refused_and_stays_as_it_is(copied, tmp_path, no_comput
 
 
 def test_an_empty_folder_is_used(tmp_path, monkeypatch):
-    def accepted(*_: Any) -> None:
-        raise InterruptedError
-
-    monkeypatch.setattr(trainer, "_begin", accepted)
-    with pytest.raises(InterruptedError):
-        train(CONFIG, tmp_path, progress=False)
+    monkeypatch.setattr(trainer._Run, "go", lambda *_: None)
+    assert train(CONFIG, tmp_path, progress=False) is None
     assert RunFolder(tmp_path).read_config() == CONFIG
 
 
@@ -357,11 +356,13 @@ def test_a_range_without_room_for_a_zone_is_refused(tmp_path, no_compute):
 
 
 def test_what_is_no_run_is_not_resumed(tmp_path, no_compute):
-    with pytest.raises(UserError, match="is not a run folder"):
-        RunFolder(tmp_path).read_config()
+    for attempt in (lambda: RunFolder(tmp_path).read_config(), lambda: train(CONFIG, tmp_path, resume=True)):
+        with pytest.raises(UserError, match="is not a run folder"):
+            attempt()
+    assert list(tmp_path.iterdir()) == []
+    RunFolder(tmp_path).write_config(CONFIG)
     with pytest.raises(UserError, match=f"resume: {tmp_path} has no checkpoint"):
         train(CONFIG, tmp_path, resume=True, progress=False)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_run_keeps_its_settings(copied, no_compute):
@@ -391,24 +392,152 @@ def test_a_tampered_configuration_is_refused(copied, content, reason):
     assert str(caught.value).startswith(f"{copied.config}: ") and reason in str(caught.value)
 
 
-def test_a_damaged_checkpoint_is_refused(copied, no_compute):
-    path = copied.checkpoint / "arrays.npz"
+def damage(folder: Path) -> None:
+    """Cut the arrays short."""
+    path = folder / "arrays.npz"
     path.write_bytes(path.read_bytes()[:-5])
-    with pytest.raises(UserError, match=r"checkpoint/arrays\.npz: damaged"):
+
+
+def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(run, copied, capsys):
+    newest, before = copied.checkpoints()
+    damage(newest)
+    assert train(CONFIG, copied.path, resume=True, progress=False) is not None
+    warned = f"warning: {newest / 'arrays.npz'}: damaged: its checksum is not the one in record.json; going on from"
+    assert capsys.readouterr().err.startswith(f"{warned} {before} instead\n")
+    assert_same_run(copied, run)
+    assert copied.checkpoints() == [newest, before]
+
+
+def test_start_from_skips_a_damaged_checkpoint_too(run, copied, tmp_path, capsys, monkeypatch):
+    newest, before = copied.checkpoints()
+    (newest / "record.json").unlink()
+    template = trainer._template(CONFIG)
+    found = trainer.load_source(copied.path, CONFIG, template)
+    assert_same_tree(found, state_of(before))
+    assert f"warning: {newest / 'record.json'}: no such file; going on from {before}" in capsys.readouterr().err
+    assert copied.checkpoints() == [newest, before]  # another run's folder is only read
+
+
+def test_without_a_good_checkpoint_all_damages_are_named(copied, no_compute):
+    newest, before = copied.checkpoints()
+    damage(newest)
+    (before / "record.json").write_text('{"format": 1, "config": {}}')
+    contents = tiny.contents(copied.path)
+    with pytest.raises(UserError) as caught:
         train(CONFIG, copied.path, resume=True, progress=False)
-    (copied.checkpoint / "record.json").write_text('{"format": 1, "config": {}}')
-    with pytest.raises(UserError, match=r"checkpoint/record\.json: curriculum: Field required"):
-        train(CONFIG, copied.path, resume=True, progress=False)
+    first, *others = str(caught.value).splitlines()
+    assert first.startswith(f"{newest / 'arrays.npz'}: damaged")
+    assert others[0] == f"{before / 'record.json'}: curriculum: Field required"
+    del contents[copied.path / "lock"]
+    assert contents.items() <= tiny.contents(copied.path).items()
+
+
+def test_what_a_killed_write_leaves_is_cleared_away(run, copied):
+    newest, before = copied.checkpoints()
+    os.replace(newest, newest.with_name(f".{newest.name}.new"))
+    assert train(CONFIG, copied.path, resume=True, progress=False) is not None
+    assert_same_run(copied, run)
+    assert sorted(path.name for path in newest.parent.iterdir()) == [before.name, newest.name]
+
+
+def test_a_failed_write_ends_the_run_at_the_next_chunk(tmp_path, monkeypatch):
+    folder = RunFolder(tmp_path / "run")
+    save = storage.save_arrays
+
+    def full(path: Path, *others: Any) -> None:
+        if path == folder.checkpoint(64):
+            raise UserError(f"{path}: cannot be written: No space left on device")
+        save(path, *others)
+
+    monkeypatch.setattr(storage, "save_arrays", full)
+    with pytest.raises(UserError, match=r"checkpoints/0000000064: cannot be written: No space left"):
+        train(CONFIG, folder.path, progress=False)
+    assert state_of(folder.checkpoints()[0]).done == 32
+
+
+def test_the_last_write_is_awaited_and_its_error_shown(tmp_path, monkeypatch):
+    folder = RunFolder(tmp_path / "run")
+    save = storage.save_arrays
+
+    def full(path: Path, *others: Any) -> None:
+        if path == folder.checkpoint(48):
+            time.sleep(0.3)
+            raise UserError("the disk is full")
+        save(path, *others)
+
+    monkeypatch.setattr(storage, "save_arrays", full)
+    with signal_after(48, signal.SIGTERM), pytest.raises(UserError, match="the disk is full"):
+        train(CONFIG, folder.path, progress=False)
+
+
+def test_two_trainers_do_not_share_a_folder(copied, no_compute):
+    before = tiny.contents(copied.path)
+    with FolderLock(copied.path):
+        with pytest.raises(UserError, match=rf"run: {copied.path} is in use by .*\(pid {os.getpid()}\)"):
+            train(CONFIG, copied.path, resume=True, progress=False)
+    assert tiny.contents(copied.path).keys() == before.keys()
+    assert train(CONFIG, copied.path, resume=True, progress=False) is not None
+
+
+def test_a_killed_process_gives_its_lock_up(tmp_path):
+    code = (
+        "import os, pathlib, signal; from koz_jax.lock import FolderLock\n"
+        f"held = FolderLock(pathlib.Path({str(tmp_path)!r}))\n"
+        "print('held', flush=True); signal.pause()"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, cwd=tiny.ROOT) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        with pytest.raises(UserError, match=f"in use by another process .pid {process.pid}"):
+            FolderLock(tmp_path)
+        process.kill()
+        process.wait()
+    with FolderLock(tmp_path):
+        pass
+
+
+def test_a_run_too_large_for_memory_is_refused_in_numbers(tmp_path, no_compute):
+    for fields, words in [
+        ({"sac": {"buffer_size": 2**31 - 1}}, ["sac.buffer_size: must be smaller, got 2147483647", "GiB are free"]),
+        ({"network": {"hidden_sizes": (2**20, 2**20)}}, ["network.hidden_sizes: must be smaller, got (1048576, "]),
+        ({"refine": {"scenarios": 2**31 - 1}}, ["refine.scenarios: must be smaller, got 2147483647"]),
+        ({"num_envs": 2**30, "sac": {"buffer_size": 2**31 - 1, "n_step": 1}}, ["must be smaller, got"]),
+    ]:
+        with pytest.raises(UserError) as caught:
+            train(changed(**fields), tmp_path / "run", progress=False)
+        assert all(word in str(caught.value) for word in words), str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_that_cannot_begin_leaves_nothing(tmp_path, monkeypatch):
+    def exhausted(*_: Any) -> None:
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 bytes.")
+
+    monkeypatch.setattr(trainer, "_begin", exhausted)
+    with pytest.raises(UserError, match=r"^out of memory: make num_envs, .* smaller; RESOURCE_EXHAUSTED"):
+        train(CONFIG, tmp_path / "run", progress=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_beginning_that_was_killed_is_no_obstacle(tmp_path, monkeypatch):
+    (tmp_path / "run" / "checkpoints" / ".0000000000.new").mkdir(parents=True)
+    (tmp_path / "run" / "lock").write_text("pid 1\n")
+    monkeypatch.setattr(trainer._Run, "go", lambda *_: None)
+    assert train(CONFIG, tmp_path / "run", progress=False) is None
+    (tmp_path / "mine" / "checkpoints" / "0000000064").mkdir(parents=True)
+    with pytest.raises(UserError, match="mine exists already"):
+        train(CONFIG, tmp_path / "mine", progress=False)
+    assert (tmp_path / "mine" / "checkpoints" / "0000000064").is_dir()
 
 
 def test_start_from_takes_learner_and_buffer(run, tmp_path):
     for source in (run.snapshot("phase1"), run.path):
-        expected = state_of(source if source != run.path else run.checkpoint).train
+        expected = state_of(source if source != run.path else run.checkpoints()[0]).train
         with pytest.MonkeyPatch.context() as patch:
             begun = []
 
-            def catch(_: Any, state: RunState, begun: list[RunState] = begun) -> None:
-                begun.append(state)
+            def catch(_: Any, saved: Checkpoint, begun: list[RunState] = begun) -> None:
+                begun.append(saved.state)
 
             patch.setattr(trainer._Run, "go", catch)
             train(CONFIG, tmp_path / source.name, start_from=source, progress=False)
@@ -465,33 +594,41 @@ def test_what_is_no_source_is_refused(run, tmp_path, no_compute):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_log_drops_what_was_lost_and_appends(tmp_path):
-    log = MetricsLog(tmp_path, 0)
-    for updates in (10, 20, 30):
-        log.write(updates, {"loss": updates / 3, "eval/score": math.nan if updates == 10 else 0.5})
+def test_the_log_goes_on_from_the_text_of_the_checkpoint(tmp_path):
+    log = MetricsLog(tmp_path, "", 0)
+    for updates in (10, 20):
+        log.write(updates, {"loss": updates / 3, "eval/score": math.nan if updates == 10 else 0.5}, {"rate": 7.0})
+    text = log.text
+    log.write(30, {"loss": 1.0}, {"rate": 7.0})
     log.close()
     path = tmp_path / "metrics.csv"
-    before = path.read_text().splitlines()
-    log = MetricsLog(tmp_path, 20)
-    assert path.read_text().splitlines() == before[:3]
-    with pytest.raises(KeyError, match="colour"):
-        log.write(30, {"colour": 1.0})
-    log.write(30, {"eval/score": 0.5, "loss": 10.0})
-    log.write(40, {"eval/score": 0.5})
-    log.close()
-    assert path.read_text().splitlines() == [*before, "40,,0.5"]
+    assert path.read_text().startswith(text)
+    for damage in (path.read_text(), path.read_text()[:-7], "", "rubbish\n"):
+        path.write_text(damage)
+        log = MetricsLog(tmp_path, text, 20)
+        assert path.read_text() == log.text == text
+        with pytest.raises(KeyError, match="colour"):
+            log.write(30, {"colour": 1.0}, {})
+        log.write(30, {"eval/score": 0.5, "loss": 10.0}, {"rate": 8.0})
+        log.write(40, {"eval/score": 0.5}, {"rate": 9.0})
+        log.close()
+        assert path.read_text() == log.text == text + "30,10,0.5\n40,,0.5\n"
     assert read_metrics(path)[0] == {"updates": "10", "loss": "3.33333333", "eval/score": ""}
-    MetricsLog(tmp_path, 5).close()
+    assert (tmp_path / "timing.csv").read_text().splitlines()[:5] == ["updates,rate", "10,7", "20,7", "30,7", "30,8"]
+    MetricsLog(tmp_path, "", 0).close()
     assert not path.exists()
 
 
-@pytest.mark.parametrize("cut", [1, 6, 11])
-def test_a_line_cut_by_a_crash_is_dropped(tmp_path, cut):
-    path = tmp_path / "metrics.csv"
-    whole = "updates,loss\n10,0.25\n"
-    path.write_text(whole + "20,0.125\n"[:-cut] if cut < 9 else "updates,loss\n"[:-cut])
-    MetricsLog(tmp_path, 20).close()
-    assert (path.read_text() if path.exists() else "") == (whole if cut < 9 else "")
+def test_a_log_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "metrics.csv").mkdir()
+    with pytest.raises(UserError, match="cannot be written: Is a directory"):
+        MetricsLog(tmp_path, "", 0)
+    (tmp_path / "metrics.csv").rmdir()
+    log = MetricsLog(tmp_path, "", 0)
+    (tmp_path / "metrics.csv").symlink_to("/dev/full")
+    with pytest.raises(UserError, match=r"metrics.csv: cannot be written: No space left on device"):
+        log.write(10, {"loss": 1.0}, {})
+    log.close()
 
 
 def test_progress_speaks_only_when_enabled(capsys, monkeypatch):
@@ -532,7 +669,7 @@ def test_the_score_of_a_phase_counts_what_it_asks_for():
 
 
 def test_the_run_folder_records_what_runs(run):
-    record = json.loads((run.checkpoint / "record.json").read_text())
+    record = json.loads((run.checkpoints()[0] / "record.json").read_text())
     assert record["done"] == 136
     assert TrainConfig.model_validate(record["config"]) == CONFIG
     assert os.access(run.config, os.R_OK)

@@ -67,6 +67,8 @@ def flags(settings: dict[str, Any], prefix: str = "--") -> list[str]:
         flag = prefix + name.replace("_", "-")
         if isinstance(value, dict):
             found += flags(value, f"{flag}.")
+        elif isinstance(value, bool):
+            found.append(flag if value else f"{prefix}no-{name.replace('_', '-')}")
         else:
             numbers = [value] if not isinstance(value, tuple) else [x for row in value for x in _row(row)]
             found += [flag, *map(str, numbers)]
@@ -133,15 +135,19 @@ def status(name: str, *argv: object) -> int:
 
 def run_python(*argv: object, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
     """Run Python in a subprocess, which shares the compiled programs of this session."""
-    environment = {
+    command = [sys.executable, *map(str, argv)]
+    return subprocess.run(command, env=environment(), cwd=cwd, capture_output=True, text=True, check=False)
+
+
+def environment() -> dict[str, str]:
+    """Variables of a subprocess that shares the compiled programs of this session."""
+    return {
         **os.environ,
         "JAX_COMPILATION_CACHE_DIR": str(CACHE),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "JAX_PLATFORMS": "cpu",
         "PYTHONPATH": str(ROOT),
     }
-    command = [sys.executable, *map(str, argv)]
-    return subprocess.run(command, env=environment, cwd=cwd, capture_output=True, text=True, check=False)
 
 
 def contents(folder: Path) -> dict[Path, bytes | None]:

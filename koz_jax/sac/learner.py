@@ -62,13 +62,15 @@ class LearnerState(struct.PyTreeNode):
 
 
 class LearnerMetrics(struct.PyTreeNode):
-    """What an update reports."""
+    """What an update reports, in the order in which it is computed."""
 
-    critic_loss: jax.Array  # ()
-    actor_loss: jax.Array  # ()
     alpha: jax.Array  # () entropy coefficient
-    entropy: jax.Array  # () of the policy, estimated on the batch
     q_mean: jax.Array  # () of the critics on the batch
+    critic_loss: jax.Array  # ()
+    critic_gradient: jax.Array  # () norm
+    entropy: jax.Array  # () of the policy, estimated on the batch
+    actor_loss: jax.Array  # ()
+    policy_gradient: jax.Array  # () norm
 
 
 def init(sac: Sac, key: jax.Array) -> LearnerState:
@@ -117,15 +119,15 @@ def update(
         q = sac.value(critic, batch.observation, batch.action)
         return losses.critic_loss(q, target), q
 
-    (critic_loss, q), gradient = jax.value_and_grad(critic_objective, has_aux=True)(learner.critic)
-    critic, critic_optimizer = _descend(gradient, learner.critic_optimizer, learner.critic, learning_rate)
+    (critic_loss, q), critic_gradient = jax.value_and_grad(critic_objective, has_aux=True)(learner.critic)
+    critic, critic_optimizer = _descend(critic_gradient, learner.critic_optimizer, learner.critic, learning_rate)
 
     def actor_objective(policy: Params) -> tuple[jax.Array, jax.Array]:
         action, log_prob = sac.act(policy, batch.observation).sample(key_policy)
         return losses.actor_loss(sac.value(critic, batch.observation, action), log_prob, alpha), log_prob
 
-    (actor_loss, log_prob), gradient = jax.value_and_grad(actor_objective, has_aux=True)(learner.policy)
-    policy, policy_optimizer = _descend(gradient, learner.policy_optimizer, learner.policy, learning_rate)
+    (actor_loss, log_prob), policy_gradient = jax.value_and_grad(actor_objective, has_aux=True)(learner.policy)
+    policy, policy_optimizer = _descend(policy_gradient, learner.policy_optimizer, learner.policy, learning_rate)
 
     gradient = jax.grad(losses.alpha_loss)(learner.log_alpha, log_prob, sac.target_entropy)
     log_alpha, alpha_optimizer = _descend(gradient, learner.alpha_optimizer, learner.log_alpha, learning_rate)
@@ -140,4 +142,13 @@ def update(
         critic_optimizer=critic_optimizer,
         alpha_optimizer=alpha_optimizer,
     )
-    return learner, LearnerMetrics(critic_loss, actor_loss, alpha, -jnp.mean(log_prob), jnp.mean(q))
+    metrics = LearnerMetrics(
+        alpha=alpha,
+        q_mean=jnp.mean(q),
+        critic_loss=critic_loss,
+        critic_gradient=optax.tree.norm(critic_gradient),
+        entropy=-jnp.mean(log_prob),
+        actor_loss=actor_loss,
+        policy_gradient=optax.tree.norm(policy_gradient),
+    )
+    return learner, metrics

@@ -1,0 +1,180 @@
+"""Cases in blocks: the same, case by case, as in one flight; interrupted, damaged, resumed, or on several devices."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+import tiny
+
+from koz_jax import blocks, evaluation, storage
+from koz_jax.errors import UserError
+from koz_jax.evaluation import MonteCarlo, MonteCarloConfig
+from koz_jax.lock import FolderLock
+from koz_jax.rollout import CaseResult
+
+CASES, BLOCK = 2300, 1000  # blocks of two chunks, and a last one that is not whole
+CONFIG = MonteCarloConfig(CASES, seed=3)
+AGENT = tiny.untrained_agent()
+
+
+def run_in_blocks(partial: Path | None = None, **changes: Any) -> MonteCarlo:
+    config = dataclasses.replace(CONFIG, **changes)
+    return blocks.run_cases(AGENT, AGENT.task, config, partial=partial, block=BLOCK, progress=False)
+
+
+def assert_same(found: CaseResult, expected: CaseResult) -> None:
+    for (path, one), (_, other) in zip(
+        jax.tree_util.tree_leaves_with_path(found), jax.tree_util.tree_leaves_with_path(expected), strict=True
+    ):
+        np.testing.assert_array_equal(one, other, err_msg=jax.tree_util.keystr(path), strict=True)
+
+
+@pytest.fixture(scope="module")
+def single() -> CaseResult:
+    """One flight of all cases."""
+    return evaluation.fly_cases(AGENT.controller, AGENT.task, CONFIG)
+
+
+@pytest.fixture
+def no_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(evaluation, "_fly_cases", lambda *_, **__: pytest.fail("something was flown"))
+
+
+def test_blocks_give_the_results_of_one_flight(single):
+    flown = run_in_blocks()
+    assert_same(flown.results, single)
+    assert (flown.agent, flown.config) == (AGENT.name, CONFIG)
+    assert flown.wall_s > 0 and flown.compile_s > 0
+
+
+# In whole chunks: elsewhere in a chunk a case is rounded differently in the last bit.
+@pytest.mark.parametrize("first", [500, 1000, 2000])
+def test_a_range_of_cases_is_a_part_of_the_flight(single, first):
+    part = dataclasses.replace(CONFIG, first=first, cases=min(1000, CASES - first))
+    found = evaluation.fly_cases(AGENT.controller, AGENT.task, part)
+    assert_same(found, jax.tree.map(lambda leaf: leaf[first : first + part.cases], single))
+
+
+def test_finished_blocks_are_kept_and_not_flown_again(single, tmp_path, monkeypatch):
+    fly, flown = evaluation.fly_cases, []
+
+    def interrupted(controller: Any, task: Any, config: MonteCarloConfig) -> CaseResult:
+        flown.append(config.first)
+        if len(flown) == 2:
+            raise KeyboardInterrupt
+        return fly(controller, task, config)
+
+    monkeypatch.setattr(evaluation, "fly_cases", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run_in_blocks(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"lock", "block-0000000000", "block-0000001000"}
+    assert_same(run_in_blocks(tmp_path).results, single)
+    assert flown == [1000, 2000]  # the resumed flight compiles with its first block, which is timed apart
+    monkeypatch.setattr(evaluation, "run_cases", lambda *_: pytest.fail("something was flown"))
+    again = run_in_blocks(tmp_path)
+    assert_same(again.results, single)
+    assert again.compile_s == 0.0 and again.wall_s > 0
+
+
+def test_more_cases_go_on_from_fewer(single, tmp_path):
+    run_in_blocks(tmp_path, cases=1500)
+    before = (tmp_path / "block-0000000000" / "arrays.npz").stat().st_mtime_ns
+    assert_same(run_in_blocks(tmp_path).results, single)
+    assert (tmp_path / "block-0000000000" / "arrays.npz").stat().st_mtime_ns == before
+
+
+def test_a_damaged_block_is_named_and_flown_again(single, tmp_path, capsys):
+    run_in_blocks(tmp_path)
+    path = tmp_path / "block-0000001000" / "arrays.npz"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 4
+    path.write_bytes(content)
+    assert_same(run_in_blocks(tmp_path).results, single)
+    assert f"warning: {path}: damaged" in capsys.readouterr().err
+    run_in_blocks(tmp_path)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.usefixtures("no_flight")
+def test_blocks_of_another_flight_are_refused(tmp_path):
+    folder = tmp_path / "block-0000000000"
+    identity = blocks._identity(AGENT, AGENT.task, CONFIG)
+    storage.save_tree(folder, {}, {"cases": BLOCK, "flight": identity, "wall_s": 1.0})
+    for changes, name in [
+        ({"seed": 4}, "seed"),
+        ({"max_angle_deg": 100.0}, "max_angle_deg"),
+        ({"substeps": 2}, "subs"),
+    ]:
+        with pytest.raises(UserError, match=rf"partial: {tmp_path} holds cases of another flight \(another {name}"):
+            run_in_blocks(tmp_path, **changes)
+    other = tiny.untrained_agent(1)
+    with pytest.raises(UserError, match=r"another controller\)"):
+        blocks.run_cases(other, AGENT.task, CONFIG, partial=tmp_path, block=BLOCK)
+    with pytest.raises(UserError, match=r"another task\)"):
+        task = AGENT.task.model_copy(update={"angle_convention": "half"})
+        blocks.run_cases(AGENT, task, CONFIG, partial=tmp_path, block=BLOCK)
+    storage.save_tree(folder, {}, {"cases": BLOCK})
+    with pytest.raises(UserError, match="another controller, task, seed"):
+        run_in_blocks(tmp_path)
+
+
+@pytest.mark.usefixtures("no_flight")
+def test_folders_that_are_not_for_blocks_are_refused(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(UserError, match=r"partial: .* holds other things \(thesis.tex\)"):
+        run_in_blocks(tmp_path)
+    with pytest.raises(UserError, match=r"partial: the folder .*thesis.tex cannot be written"):
+        run_in_blocks(tmp_path / "thesis.tex")
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+    (tmp_path / "used").mkdir()
+    with FolderLock(tmp_path / "used"), pytest.raises(UserError, match=r"partial: .*used is in use by another process"):
+        run_in_blocks(tmp_path / "used")
+
+
+def test_the_command_keeps_blocks(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(blocks, "BLOCK", BLOCK)
+    AGENT.save(tmp_path / "agent")
+    argv = [
+        "--agent",
+        tmp_path / "agent",
+        "--cases",
+        1100,
+        "--partial",
+        tmp_path / "kept",
+        "--json",
+        tmp_path / "x.json",
+    ]
+    assert tiny.status("eval_mc", *argv) == 0
+    first = json.loads((tmp_path / "x.json").read_text())
+    assert sorted(path.name for path in (tmp_path / "kept").iterdir()) == ["block-0000000000", "lock"]
+    assert tiny.status("eval_mc", *argv) == 0
+    second = json.loads((tmp_path / "x.json").read_text())
+    assert {**first, "compile_s": 0.0} == second
+    capsys.readouterr()
+    assert tiny.status("eval_mc", *argv[:4], "--partial", tmp_path / "kept", "--replay-case", 3) == 2
+    assert "partial: is not written with --replay-case" in capsys.readouterr().err
+
+
+# Flies cases on the devices that there are, and writes the results.
+FLY = """
+import sys, jax
+import test_blocks
+from koz_jax import evaluation, storage
+assert jax.local_device_count() == int(sys.argv[1])
+results = evaluation.fly_cases(test_blocks.AGENT.controller, test_blocks.AGENT.task, test_blocks.CONFIG)
+storage.save_tree(__import__("pathlib").Path(sys.argv[2]), results, {})
+"""
+
+
+def test_four_devices_give_the_results_of_one(single, tmp_path, monkeypatch):
+    assert jax.local_device_count() == 1
+    monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=4")
+    monkeypatch.chdir(tmp_path)
+    done = tiny.run_python("-c", FLY, 4, tmp_path / "results", cwd=tiny.ROOT / "tests")
+    assert done.returncode == 0, done.stderr[-2000:]
+    shapes = jax.eval_shape(lambda: single)
+    assert_same(jax.tree.map(np.asarray, storage.load_tree(tmp_path / "results", shapes)), single)
