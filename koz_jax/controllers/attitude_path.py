@@ -91,9 +91,9 @@ def fastest_timing(samples: Samples, spacecraft: Spacecraft, torque_limit: jax.A
     middle_B = 0.5 * (samples.slope_B[1:] + samples.slope_B[:-1])
     change_B = (samples.slope_B[1:] - samples.slope_B[:-1]) / step
     along_B = jax.vmap(dynamics.matvec, in_axes=(None, 0))(spacecraft.inertia_B, middle_B)
-    curved_B = jax.vmap(dynamics.matvec, in_axes=(None, 0))(spacecraft.inertia_B, change_B) + jax.vmap(
-        rotations.cross
-    )(middle_B, along_B)
+    curved_B = jax.vmap(dynamics.matvec, in_axes=(None, 0))(spacecraft.inertia_B, change_B) + jax.vmap(rotations.cross)(
+        middle_B, along_B
+    )
     # With x = (ds/dt)^2 at both ends of a piece, torque = ahead x_end + back x_begin.
     ahead = (0.5 * curved_B + along_B / (2.0 * step)) / torque_limit
     back = (0.5 * curved_B - along_B / (2.0 * step)) / torque_limit
@@ -102,9 +102,7 @@ def fastest_timing(samples: Samples, spacecraft: Spacecraft, torque_limit: jax.A
         found = _largest_begin(*rows, x_end)
         return found, found
 
-    def fastest_end(
-        x_begin: jax.Array, rows: tuple[jax.Array, jax.Array, jax.Array]
-    ) -> tuple[jax.Array, jax.Array]:
+    def fastest_end(x_begin: jax.Array, rows: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         ahead, back, most = rows
         room = 1.0 - jnp.sign(ahead) * back * x_begin
         found = jnp.clip(jnp.min(room / jnp.maximum(jnp.abs(ahead), 1e-9)), 1e-9, most)

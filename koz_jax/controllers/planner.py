@@ -1,11 +1,13 @@
 """Attitude path planning around the zones, tracked by feedback.
 
 Before the maneuver a path is searched for: candidates bend the eigen-axis turn aside, each is timed as fast as the
-torque box allows, and the fastest that keeps its distance from all zones is refined at random.  After Frazzoli, Dahleh,
-Feron & Kornfeld, "A randomized attitude slew planning algorithm for autonomous spacecraft" (AIAA GNC 2001), and
-Kjellberg & Lightsey, "Discretized constrained attitude pathfinding and control for satellites" (JGCD 2013), who search
-a tree and a grid of attitudes instead.
+torque box allows, and the fastest that keeps its distance from all zones is refined by a cross-entropy search.  After
+Frazzoli, Dahleh, Feron & Kornfeld, "A randomized attitude slew planning algorithm for autonomous spacecraft" (AIAA GNC
+2001), and Kjellberg & Lightsey, "Discretized constrained attitude pathfinding and control for satellites" (JGCD 2013),
+who search a tree and a grid of attitudes instead.
 """
+
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -33,6 +35,13 @@ class Plan(struct.PyTreeNode):
         return RigidBodyState(q, speed * slope_B)
 
 
+class _Found(struct.PyTreeNode):
+    """Where a search stands."""
+
+    mean_B: jax.Array  # (sines, 3) [rad] of the better candidates
+    best_B: jax.Array  # (sines, 3) [rad]
+
+
 class PathPlanner(struct.PyTreeNode):
     """Plans in ``begin``, tracks in ``decide``.
 
@@ -44,10 +53,10 @@ class PathPlanner(struct.PyTreeNode):
     bandwidth: Gain = 1.0  # () [1/s]
     rate_bandwidth: Gain = 3.0  # () [1/s]
     patience: Gain = 0.1  # () [rad] tracking error at which the plan waits
-    sines: int = struct.field(pytree_node=False, default=3)  # of the bend
+    sines: int = struct.field(pytree_node=False, default=2)  # of the bend
     points: int = struct.field(pytree_node=False, default=49)  # of a path
     candidates: int = struct.field(pytree_node=False, default=32)  # of a round of refinement
-    rounds: int = struct.field(pytree_node=False, default=8)
+    rounds: int = struct.field(pytree_node=False, default=16)
 
     def begin(self, state: EnvState, params: EnvParams, key: jax.Array) -> Plan:
         """Search for a path from the state to its target."""
@@ -59,21 +68,29 @@ class PathPlanner(struct.PyTreeNode):
             timing = attitude_path.fastest_timing(samples, params.spacecraft, limit)
             return timing.duration + _SECONDS_PER_SHORTFALL * jnp.maximum(self.margin - clear, 0.0)
 
-        def best_of(bends_B: jax.Array) -> jax.Array:
-            return bends_B[jnp.argmin(jax.vmap(cost)(bends_B))]
-
-        def refine(best_B: jax.Array, round_: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
-            key_round, spread = round_
-            changes_B = spread * jax.random.normal(key_round, (self.candidates, self.sines, 3))
-            return best_of(best_B + changes_B.at[0].set(0.0)), None
-
         limit = self.torque_share * params.spacecraft.torque_limit
-        first_B = best_of(self._first_bends(state, params))
-        spreads = jnp.geomspace(*_SPREADS, self.rounds)
-        bends_B, _ = jax.lax.scan(refine, first_B, (jax.random.split(key, self.rounds), spreads))
+        bends_B = self._search(cost, self._first_bends(state, params), key)
         path = attitude_path.from_state(state.body, state.scenario.q_DN, bends_B)
         samples = attitude_path.sample(path, self.points)
         return Plan(path, attitude_path.fastest_timing(samples, params.spacecraft, limit), jnp.zeros(()))
+
+    def _search(self, cost: Callable[[jax.Array], jax.Array], first_B: jax.Array, key: jax.Array) -> jax.Array:
+        """Cross-entropy search from the best of the first bends (n, sines, 3).  Returns the best found (sines, 3)."""
+        order = 1.0 / jnp.arange(1.0, self.sines + 1)[:, None]
+        elite = max(self.candidates // 4, 1)
+        weights = jnp.log(elite + 0.5) - jnp.log(jnp.arange(1.0, elite + 1))
+
+        def refine(found: _Found, draw: tuple[jax.Array, jax.Array]) -> tuple[_Found, None]:
+            key_round, spread = draw
+            changes_B = spread * order * jax.random.normal(key_round, (self.candidates, self.sines, 3))
+            tried_B = (found.mean_B + changes_B).at[0].set(found.best_B)
+            best_first = tried_B[jnp.argsort(jax.vmap(cost)(tried_B))]
+            mean_B = jnp.tensordot(weights / jnp.sum(weights), best_first[:elite], axes=1)
+            return _Found(mean_B, best_first[0]), None
+
+        begin_B = first_B[jnp.argmin(jax.vmap(cost)(first_B))]
+        draws = (jax.random.split(key, self.rounds), jnp.geomspace(*_SPREADS, self.rounds))
+        return jax.lax.scan(refine, _Found(begin_B, begin_B), draws)[0].best_B
 
     def _first_bends(self, state: EnvState, params: EnvParams) -> jax.Array:
         """Bends to all sides, by several angles.  Returns (..., sines, 3) [rad]."""
@@ -110,5 +127,5 @@ _SECONDS_PER_SHORTFALL = 2000.0
 _BENDS_DEG = (30.0, 50.0, 80.0, 120.0)
 _SIDES = 8
 
-# Standard deviation [rad] of the first and of the last round of refinement.
-_SPREADS = (0.3, 0.02)
+# Standard deviation [rad] of the first sine's amplitude in the first and in the last round; less for further sines.
+_SPREADS = (0.3, 0.03)
