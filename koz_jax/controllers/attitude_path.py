@@ -1,9 +1,10 @@
 """Attitude paths: an eigen-axis turn bent aside, and how fast the torque box lets it be flown.
 
-A path is q(s) = q_start (x) exp(bend(s)) (x) exp(s turn) for s from 0 to 1, with the bend a sum of sines that vanishes
-at both ends.  Its timing is the fastest that keeps the torque in its box, with rest at both ends: a backward pass for
-the rates from which one can still stop, then a forward pass along the limit (H. Pham, Q.-C. Pham, "A new approach to
-time-optimal path parameterization based on reachability analysis", IEEE Transactions on Robotics 34 (2018)).
+A path is q(s) = q_end (x) exp(bend(s)) (x) exp((s - 1) turn) for s from 0 to 1, with the bend a sum of sines that
+vanishes at both ends: without rounding at its end, where the body will stay.  Its timing is the fastest that keeps the
+torque in its box, with rest at both ends: a backward pass for the rates from which one can still stop, then a forward
+pass along the limit (H. Pham, Q.-C. Pham, "A new approach to time-optimal path parameterization based on reachability
+analysis", IEEE Transactions on Robotics 34 (2018)).
 """
 
 import itertools
@@ -21,16 +22,16 @@ from koz_jax.keep_out import KeepOutZone
 class AttitudePath(struct.PyTreeNode):
     """A path without timing."""
 
-    q_start: jax.Array  # (4,) attitude at its start, relative to inertial
+    q_end: jax.Array  # (4,) attitude at its end, relative to inertial
     turn_B: jax.Array  # (3,) [rad] rotation vector from start to end
-    bends_B: jax.Array  # (sines, 3) [rad] amplitude of each sine, in the axes of the start
+    bends_B: jax.Array  # (sines, 3) [rad] amplitude of each sine, in the axes of the end
 
     def attitude(self, s: jax.Array) -> jax.Array:
         """q(s).  s: () in [0, 1].  Returns (4,)."""
-        sines = jnp.sin(jnp.pi * s * jnp.arange(1, self.bends_B.shape[0] + 1))
+        sines = jnp.sin(jnp.pi * (1.0 - s) * jnp.arange(1, self.bends_B.shape[0] + 1))
         bend_B = jnp.sum(sines[:, None] * self.bends_B, axis=0)
-        aside = rotations.multiply(self.q_start, feedback.from_rotation_vector(bend_B))
-        return rotations.multiply(aside, feedback.from_rotation_vector(s * self.turn_B))
+        aside = rotations.multiply(self.q_end, feedback.from_rotation_vector(bend_B))
+        return rotations.multiply(aside, feedback.from_rotation_vector((s - 1.0) * self.turn_B))
 
     def attitude_and_slope(self, s: jax.Array) -> tuple[jax.Array, jax.Array]:
         """q(s) (4,), and the body rate (3,) [rad] per unit of s."""
@@ -58,7 +59,9 @@ class Timing(struct.PyTreeNode):
         passed = now - self.time[i]
         acceleration = (self.speed[i + 1] - self.speed[i]) / length
         s = i / pieces + (self.speed[i] + 0.5 * acceleration * passed) * passed
-        return jnp.clip(s, 0.0, 1.0), self.speed[i] + acceleration * passed
+        speed = self.speed[i] + acceleration * passed
+        arrived = time >= self.duration
+        return jnp.where(arrived, 1.0, jnp.clip(s, 0.0, 1.0)), jnp.where(arrived, 0.0, speed)
 
 
 class Samples(struct.PyTreeNode):
@@ -142,4 +145,4 @@ def from_state(body: RigidBodyState, q_DN: jax.Array, bends_B: jax.Array) -> Att
     q_DN: (4,); bends_B: (sines, 3) [rad].
     """
     turn_B = feedback.rotation_vector(rotations.multiply(rotations.conjugate(body.q_BN), q_DN))
-    return AttitudePath(body.q_BN, turn_B, bends_B)
+    return AttitudePath(q_DN, turn_B, bends_B)

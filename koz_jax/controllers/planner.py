@@ -95,7 +95,7 @@ class PathPlanner(struct.PyTreeNode):
     def _first_bends(self, state: EnvState, params: EnvParams) -> jax.Array:
         """Bends to all sides, by several angles.  Returns (..., sines, 3) [rad]."""
         straight = attitude_path.from_state(state.body, state.scenario.q_DN, jnp.zeros((self.sines, 3)))
-        half_way = feedback.from_rotation_vector(0.5 * straight.turn_B)
+        half_way = feedback.from_rotation_vector(-0.5 * straight.turn_B)
         look_B = rotations.rotate(half_way, params.spacecraft.boresight_B)
         # A turn about an axis square to the boresight moves it most.
         square_B = rotations.cross(look_B, jnp.eye(3)[jnp.argmin(jnp.abs(look_B))])

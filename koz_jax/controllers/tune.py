@@ -32,7 +32,10 @@ _TEST_SEED = 0
 
 @dataclasses.dataclass(frozen=True)
 class TuneArgs:
-    """Tune the gains of a classical controller for the mean of the paper's reward without violations; pd does not count the zone."""
+    """Tune the gains of a classical controller for the mean of the paper's reward, without violations.
+
+    For pd, which does not know it, the zone does not count.
+    """
 
     name: tyro.conf.Positional[str]
     """Which controller: pd, potential, sliding or planner."""
@@ -47,17 +50,6 @@ class TuneArgs:
     spread: float = 0.7
     """Standard deviation of the logarithm of each gain in the first round; a tenth of it in the last."""
 
-    def __post_init__(self) -> None:
-        if self.name not in CLASSICAL:
-            raise UserError(f"name: must be one of {', '.join(CLASSICAL)}; got {self.name!r}")
-        if not 0 < self.seed < 2**32:
-            raise UserError(f"seed: must be from 1 to 2^32 - 1, as {_TEST_SEED} draws the test; got {self.seed}")
-        for field in ("cases", "candidates", "rounds"):
-            if getattr(self, field) < 1:
-                raise UserError(f"{field}: must be at least 1, got {getattr(self, field)}")
-        if not self.spread > 0.0:
-            raise UserError(f"spread: must be above 0, got {self.spread}")
-
 
 def main(argv: list[str]) -> int:
     """Tune and print.  Returns the exit status."""
@@ -65,6 +57,7 @@ def main(argv: list[str]) -> int:
 
 
 def _tune(args: TuneArgs) -> int:
+    _check(args)
     from koz_jax import runtime
 
     runtime.configure()
@@ -78,6 +71,18 @@ def _tune(args: TuneArgs) -> int:
     for name, value in gains(best).items():
         print(f"{name} = {value:.4g}")
     return 0
+
+
+def _check(args: TuneArgs) -> None:
+    if args.name not in CLASSICAL:
+        raise UserError(f"name: must be one of {', '.join(CLASSICAL)}; got {args.name!r}")
+    if not 0 < args.seed < 2**32:
+        raise UserError(f"seed: must be from 1 to 2^32 - 1, as {_TEST_SEED} draws the test; got {args.seed}")
+    for field in ("cases", "candidates", "rounds"):
+        if getattr(args, field) < 1:
+            raise UserError(f"{field}: must be at least 1, got {getattr(args, field)}")
+    if not args.spread > 0.0:
+        raise UserError(f"spread: must be above 0, got {args.spread}")
 
 
 def search(pilot: NamedController, args: TuneArgs) -> Iterator[tuple[Controller, float]]:
