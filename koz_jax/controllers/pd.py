@@ -21,9 +21,9 @@ class QuaternionFeedback(Memoryless):
     Without saturation the error decays with ``bandwidth`` and the rate follows with ``rate_bandwidth``.
     """
 
-    bandwidth: Gain = 1.0  # () [1/s]
-    rate_bandwidth: Gain = 3.0  # () [1/s]
-    torque_share: Gain = 0.9  # () of the torque limit that braking counts on
+    bandwidth: Gain = 7.34  # () [1/s]
+    rate_bandwidth: Gain = 0.693  # () [1/s]
+    torque_share: Gain = 0.958  # () of the torque limit that braking counts on
 
     def decide(self, state: EnvState, params: EnvParams, memory: None) -> tuple[jax.Array, None]:
         """Action (3,)."""

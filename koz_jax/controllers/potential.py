@@ -61,10 +61,10 @@ class PotentialFeedback(Memoryless):
     ratio.
     """
 
-    frequency: Gain = 0.5  # () [rad/s]
-    damping: Gain = 1.0  # () ratio
-    barrier: Gain = 0.2  # ()
-    margin: Gain = 0.05  # () [rad]
+    frequency: Gain = 1.27  # () [rad/s]
+    damping: Gain = 4.46  # () ratio
+    barrier: Gain = 0.33  # ()
+    margin: Gain = 0.0523  # () [rad]
 
     def decide(self, state: EnvState, params: EnvParams, memory: None) -> tuple[jax.Array, None]:
         """Action (3,)."""
