@@ -114,8 +114,9 @@ def test_what_passes_leads_to_a_safe_state_or_is_the_brake(seed):
     assert np.all(np.abs(allowed_B) <= 2.0 + 1e-6)
     brake_B = np.asarray(jax.vmap(lambda body: shield.brake_torque(SHIELD, body, PARAMS))(bodies))
     braked = np.all(np.abs(allowed_B - brake_B) < 1e-5, axis=1)
-    state = (np.asarray(leaf, np.float64) for leaf in (bodies.q_BN, bodies.omega_BN_B))
-    after = RigidBodyState(*map(jnp.float32, oracle.propagate_many(*state, allowed_B, oracle.DT)))
+    q, omega = (np.asarray(leaf, np.float64) for leaf in (bodies.q_BN, bodies.omega_BN_B))
+    q, omega = oracle.propagate_many(q, omega, allowed_B, oracle.DT)
+    after = RigidBodyState(jnp.float32(q), jnp.float32(omega))
     half = jax.vmap(lambda body, zone: shield.is_safe(SHIELD, body, zone, PARAMS, 0.49 * SHIELD.margin))
     assert np.all(braked | np.asarray(half(after, zones)))
 

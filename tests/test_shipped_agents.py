@@ -17,8 +17,8 @@ def phase2_summary():
     return summarise(evaluation.fly_cases(agent.controller, agent.task, CASES))
 
 
-def test_the_shipped_agents_are_the_two_phases_and_phase_2_before_refinement():
-    assert shipped_agents() == ("phase1", "phase2", "phase2-sac")
+def test_the_shipped_agents_are_the_two_phases_phase_2_before_refinement_and_one_for_several_zones():
+    assert shipped_agents() == ("phase1", "phase2", "phase2-sac", "zones3")
 
 
 @pytest.mark.parametrize("name", ["phase1", "phase2"])
@@ -57,3 +57,11 @@ def test_phase_2_reproduces_its_own_table(phase2_summary):
         error = float(table[f"{mean}_std"]) * np.sqrt(1 / CASES.cases + 1 / 10_000)
         assert abs(getattr(phase2_summary, f"{mean}_mean") - float(table[f"{mean}_mean"])) < 5 * error
     assert phase2_summary.success_rate >= float(table["success_rate"]) - 0.004
+
+
+def test_the_agent_for_several_zones_flies_around_three_of_them():
+    agent = load_agent("zones3")
+    task = agent.task.with_rules(zones=3)
+    found = summarise(evaluation.fly_cases(agent.controller, task, CASES))
+    assert found.success_rate >= 0.97
+    assert found.violation_rate <= 0.005
