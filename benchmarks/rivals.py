@@ -14,11 +14,13 @@ import time
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 
 from koz_jax import evaluation, rollout, runtime, scenario, shield, storage, task
 from koz_jax.agent import load_agent
-from koz_jax.controllers.base import Controller, Pilot
+from koz_jax.controllers.base import Controller, Memoryless, Pilot
 from koz_jax.controllers.registry import CLASSICAL, ROGUES, load_controller
+from koz_jax.env import EnvParams, EnvState
 from koz_jax.errors import exit_status
 from koz_jax.evaluation import MonteCarloConfig
 from koz_jax.rollout import Conditions
@@ -69,8 +71,15 @@ def decision_us(controller: Controller, task_config: TaskConfig, guard: ShieldCo
             times.append(time.perf_counter() - start)
         return min(times)
 
-    idle = load_controller("random").controller
-    return 1e6 * (seconds(controller, Conditions(shield=made)) - seconds(idle, Conditions())) / steps
+    return 1e6 * (seconds(controller, Conditions(shield=made)) - seconds(_Idle(), Conditions())) / steps
+
+
+class _Idle(Memoryless):
+    """Decides nothing."""
+
+    def decide(self, state: EnvState, params: EnvParams, memory: None) -> tuple[jax.Array, None]:
+        """No torque."""
+        return jnp.zeros(3), memory
 
 
 def judge(pilot: Pilot, task_config: TaskConfig, cases: int, guard: ShieldConfig | None) -> Row:

@@ -161,7 +161,7 @@ def _add_zones(key: jax.Array, ranges: ScenarioRanges, looks_D: jax.Array, first
         axes = axes * jnp.where(axes @ first.axis_N[0] < 0.0, -1.0, 1.0)[:, None]
         clear = jax.vmap(to_all, in_axes=(0, None))(axes, looks_D) >= half_angle + ranges.separation
         room = half_angle + zones.half_angle + ranges.zone_gap
-        apart = jax.vmap(to_all, in_axes=(0, None))(axes, zones.axis_N) >= room
+        apart = jax.vmap(to_all, in_axes=(0, None))(axes, zones.axis_N) >= room[None]
         fits = jnp.all(clear, axis=1) & jnp.all(apart, axis=1)
         place = jnp.argmax(fits)
         wanted = (i < number) & fits[place]

@@ -152,3 +152,50 @@ def test_gradient_of_the_observation_is_finite_where_the_boresight_is_along_the_
         return observation.observe(state.replace(body=state.body.replace(q_BN=q)), params)
 
     assert np.all(np.isfinite(jax.jit(jax.jacobian(observed))(jnp.array(IDENTITY, jnp.float32))))
+
+
+def _crowded(drawn, zones: int) -> EnvState:
+    """The first sample of the draw, with so many zones around it."""
+    rng = np.random.default_rng(7)
+    axes = np.stack([oracle.random_direction(rng) for _ in range(zones)])
+    flown = _scenario(drawn["q"][0], drawn["omega"][0], drawn["q_target"][0], axes[0], 0.3)
+    several = KeepOutZone(jnp.asarray(axes, jnp.float32), jnp.asarray(rng.uniform(0.2, 0.5, zones), jnp.float32))
+    return reset(flown.replace(zones=several))
+
+
+def _only(state: EnvState, zone: int) -> EnvState:
+    """The same state with one of its zones alone."""
+    alone = jax.tree.map(lambda leaf: leaf[zone : zone + 1], state.scenario.zones)
+    return state.replace(scenario=state.scenario.replace(zones=alone))
+
+
+ZONE_PARTS = ("zone_margin", "zone_angle", "zone_direction_B")
+
+
+def test_several_zones_are_seen_nearest_first_each_as_if_it_were_alone(drawn, params):
+    state = _crowded(drawn, 4)
+    found, where = observation.observe(state, params, 3), observation.slices(3)
+    assert found.shape == (observation.size(3),) == (26,)
+    alone = [observe(_only(state, zone), params) for zone in range(4)]
+    alone.sort(key=lambda seen: float(seen[observation.SLICES["zone_margin"]][0]))
+    np.testing.assert_allclose(found[:16], alone[0], atol=1e-6)
+    for number, seen in enumerate(alone[1:3], start=2):
+        for name in ZONE_PARTS:
+            np.testing.assert_allclose(found[where[f"{number}_{name}"]], seen[observation.SLICES[name]], atol=1e-6)
+
+
+def test_the_order_of_the_zones_does_not_matter(drawn, params):
+    state = _crowded(drawn, 3)
+    turned = state.replace(
+        scenario=state.scenario.replace(zones=jax.tree.map(lambda leaf: leaf[::-1], state.scenario.zones))
+    )
+    np.testing.assert_array_equal(observation.observe(turned, params, 3), observation.observe(state, params, 3))
+
+
+def test_places_for_zones_that_are_not_there_read_far_away(drawn, params):
+    state = _only(_crowded(drawn, 2), 0)
+    found, where = observation.observe(state, params, 3), observation.slices(3)
+    np.testing.assert_allclose(found[:16], observe(state, params), atol=1e-6)
+    for number in (2, 3):
+        values = [found[where[f"{number}_{name}"]] for name in ZONE_PARTS]
+        np.testing.assert_allclose(np.concatenate(values), [np.pi, np.pi, 0.0, 0.0, 0.0], atol=1e-6)
