@@ -78,7 +78,9 @@ def maneuver_cost(controller: PolicyController, key: jax.Array, config: TrainCon
     boresight_B = params.spacecraft.boresight_B
     rule = config.task.scenario.infeasible_zone
     guard = make_shield(config, params)
-    drawn = scenario.sample(key, ranges, boresight_B, rule, MAX_DRAWS, keep_angle=True)
+    drawn = shield.safe_start(
+        guard, scenario.sample(key, ranges, boresight_B, rule, MAX_DRAWS, keep_angle=True), params
+    )
 
     def advance(state: EnvState, _: None) -> tuple[EnvState, jax.Array]:
         action = controller.act(observation.observe(state, params, config.network.observed_zones))

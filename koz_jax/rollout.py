@@ -106,10 +106,7 @@ def _take_off(
     A start that the shield does not call safe is slowed down until it is.
     """
     key_controller, key_truth, key_noise = jax.random.split(key, 3)
-    if conditions.shield is not None:
-        begin = shield.slow_down(conditions.shield, scenario.initial, scenario.zones, params)
-        scenario = scenario.replace(initial=begin)
-    state = env.reset(scenario)
+    state = env.reset(shield.safe_start(conditions.shield, scenario, params))
     truth = params
     if conditions.uncertainty is not None:
         truth = uncertainty.draw_truth(conditions.uncertainty, params, key_truth)

@@ -17,6 +17,7 @@ from koz_jax import dynamics, env, keep_out, rotations
 from koz_jax.dynamics import RigidBodyState, Spacecraft
 from koz_jax.env import EnvParams, EnvState
 from koz_jax.keep_out import KeepOutZone
+from koz_jax.scenario import Scenario
 from koz_jax.shield_config import ShieldConfig
 from koz_jax.uncertainty import NOISE_BOUND
 
@@ -101,17 +102,20 @@ def for_spacecraft(config: ShieldConfig, spacecraft: Spacecraft, dt: jax.Array) 
     )
 
 
-def slow_down(shield: Shield, body: RigidBodyState, zones: KeepOutZone, params: EnvParams) -> RigidBodyState:
-    """Halve the rate until the state is safe; a state at rest that is not is returned at rest.
+def safe_start(shield: Shield | None, scenario: Scenario, params: EnvParams) -> Scenario:
+    """Halve the initial rate until the state is safe; without a shield the scenario stays as it is.
 
-    The guarantee holds from safe states only, so this is where a maneuver under the shield may begin.
+    The guarantee holds from safe states only.  A start that is not safe even at rest is returned at rest.
     """
+    if shield is None:
+        return scenario
 
     def too_fast(body: RigidBodyState) -> jax.Array:
         moves = rotations.norm(body.omega_BN_B) > 1e-9
-        return moves & ~is_safe(shield, body, zones, params, shield.margin)
+        return moves & ~is_safe(shield, body, scenario.zones, params, shield.margin)
 
-    return jax.lax.while_loop(too_fast, lambda body: body.replace(omega_BN_B=0.5 * body.omega_BN_B), body)
+    slowed = jax.lax.while_loop(too_fast, lambda body: body.replace(omega_BN_B=0.5 * body.omega_BN_B), scenario.initial)
+    return scenario.replace(initial=slowed)
 
 
 def brake_torque(shield: Shield, body: RigidBodyState, params: EnvParams) -> jax.Array:

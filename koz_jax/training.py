@@ -66,17 +66,18 @@ def _reset_envs(config: TrainConfig, params: EnvParams, at: Difficulty, key: jax
         min_angle=at.min_angle, max_angle=at.max_angle, angle_bias=at.angle_bias
     )
 
+    guard = make_shield(config, params)
+
     def fresh(key_case: jax.Array) -> EnvState:
-        return env.reset(
-            scenario.sample(
-                key_case,
-                ranges,
-                params.spacecraft.boresight_B,
-                config.task.scenario.infeasible_zone,
-                max_draws=MAX_DRAWS,
-                keep_angle=True,
-            )
+        drawn = scenario.sample(
+            key_case,
+            ranges,
+            params.spacecraft.boresight_B,
+            config.task.scenario.infeasible_zone,
+            max_draws=MAX_DRAWS,
+            keep_angle=True,
         )
+        return env.reset(shield.safe_start(guard, drawn, params))
 
     return jax.vmap(fresh)(jax.random.split(key, config.num_envs))
 

@@ -19,6 +19,7 @@ from koz_jax.dynamics import RigidBodyState
 from koz_jax.env import EnvParams, EnvState
 from koz_jax.evaluation import MonteCarloConfig
 from koz_jax.keep_out import NO_ZONE_HALF_ANGLE, KeepOutZone
+from koz_jax.scenario import Scenario
 from koz_jax.shield_config import ShieldConfig, UncertaintyConfig
 from koz_jax.task_config import SpacecraftConfig, TaskConfig
 
@@ -166,7 +167,9 @@ def test_the_brake_takes_the_momentum_away_at_full_strength_and_then_rests():
 
 def test_a_start_is_slowed_down_until_it_is_safe_and_no_further():
     bodies, zones = _states(7, 0.5)
-    slowed = jax.jit(jax.vmap(lambda body, zone: shield.slow_down(SHIELD, body, zone, PARAMS)))(bodies, zones)
+    target = jnp.array([1.0, 0.0, 0.0, 0.0])
+    begin = jax.vmap(lambda body, zone: shield.safe_start(SHIELD, Scenario(body, target, zone), PARAMS))
+    slowed = jax.jit(begin)(bodies, zones).initial
     safe = np.asarray(_safe(bodies, zones))
     np.testing.assert_array_equal(slowed.omega_BN_B[safe], bodies.omega_BN_B[safe])
     at_rest = bodies.replace(omega_BN_B=jnp.zeros_like(bodies.omega_BN_B))
