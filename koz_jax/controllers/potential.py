@@ -61,6 +61,7 @@ class PotentialFeedback(Memoryless):
     ratio.
     """
 
+    # ``python -m koz_jax.controllers.tune potential``, seed 1, at commit 9511a86.
     frequency: Gain = 1.27  # () [rad/s]
     damping: Gain = 4.46  # () ratio
     barrier: Gain = 0.33  # ()
