@@ -34,7 +34,9 @@ class QuaternionFeedback(Memoryless):
             angle = rotations.norm(error_B)
             axis_B = error_B / jnp.where(angle > 0.0, angle, 1.0)
             rate = jnp.abs(rotations.dot(omega_B, axis_B))
-            brake = feedback.deceleration_about(axis_B, jax.lax.stop_gradient(rate), params.spacecraft, self.torque_share)
+            brake = feedback.deceleration_about(
+                axis_B, jax.lax.stop_gradient(rate), params.spacecraft, self.torque_share
+            )
             return -feedback.brake_rate(angle, jax.lax.stop_gradient(brake), self.bandwidth) * axis_B
 
         wanted_B, change_B = jax.jvp(wanted_rate, (q_e,), (dynamics.attitude_rate(q_e, omega_B),))
