@@ -7,6 +7,7 @@ from pathlib import Path
 import jax
 import numpy as np
 from flax import struct
+from flax.traverse_util import flatten_dict
 
 from koz_jax import encoding, observation, storage
 from koz_jax.agent_files import Provenance, Record, find_agent, read_agent_record, shipped_agents, shipped_folder
@@ -14,6 +15,7 @@ from koz_jax.config import NetworkConfig
 from koz_jax.controllers.base import Memoryless
 from koz_jax.env import EnvParams, EnvState
 from koz_jax.layout import as_observations
+from koz_jax.numpy_policy import NumpyPolicy, from_arrays
 from koz_jax.sac.networks import Params, Policy
 from koz_jax.task_config import TaskConfig
 
@@ -70,10 +72,17 @@ class Agent:
         observed = as_observations(observations, self.controller.network.observed_zones)
         return np.asarray(_act(self.controller, observed))
 
+    def to_numpy(self) -> NumpyPolicy:
+        """The deterministic policy without jax, as ``numpy_policy.load_policy`` reads it."""
+        arrays = {name: np.asarray(leaf) for name, leaf in flatten_dict(self.controller.policy, sep="/").items()}
+        return from_arrays(arrays, self._record(), self.name)
+
+    def _record(self) -> Record:
+        return Record(network=self.controller.network, task=self.task, provenance=self.provenance)
+
     def save(self, folder: Path | str) -> None:
         """Write the agent as a folder of arrays and JSON."""
-        record = Record(network=self.controller.network, task=self.task, provenance=self.provenance)
-        storage.save_tree(Path(folder), self.controller.policy, record.model_dump())
+        storage.save_tree(Path(folder), self.controller.policy, self._record().model_dump())
 
 
 @jax.jit
