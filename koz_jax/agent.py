@@ -5,9 +5,10 @@ import functools
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from flax.traverse_util import flatten_dict
+from flax.traverse_util import flatten_dict, unflatten_dict
 
 from koz_jax import encoding, observation, storage
 from koz_jax.agent_files import Provenance, Record, find_agent, read_agent_record, shipped_agents, shipped_folder
@@ -17,6 +18,7 @@ from koz_jax.env import EnvParams, EnvState
 from koz_jax.layout import as_observations
 from koz_jax.numpy_policy import NumpyPolicy, from_arrays
 from koz_jax.sac.networks import Params, Policy
+from koz_jax.sb3_policy import is_sb3, read_sb3
 from koz_jax.task_config import TaskConfig
 
 __all__ = [
@@ -91,7 +93,11 @@ def _act(controller: PolicyController, observed: jax.Array) -> jax.Array:
 
 
 def load_agent(name: str | Path = "phase2") -> Agent:
-    """Load an agent by name or folder; see ``find_agent``."""
+    """Load an agent by name or folder, see ``find_agent``; or a zip of Stable-Baselines3, see ``sb3_policy``."""
+    if is_sb3(name):
+        record, arrays = read_sb3(name)
+        policy = unflatten_dict({leaf: jnp.asarray(array) for leaf, array in arrays.items()}, sep="/")
+        return Agent(PolicyController(policy, record.network), record.task, record.provenance, str(name))
     folder = find_agent(name)
     record = read_agent_record(folder)
     template = jax.eval_shape(

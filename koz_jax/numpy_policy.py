@@ -76,14 +76,19 @@ def from_arrays(arrays: Mapping[str, np.ndarray], record: Record, name: str) -> 
     """
     layers = []
     for number, (inputs, outputs) in enumerate(_shapes(record.network)):
-        kernel = _array(arrays, f"params/Mlp_0/Dense_{number}/kernel", (inputs, outputs))
-        bias = _array(arrays, f"params/Mlp_0/Dense_{number}/bias", (outputs,))
-        layers.append(Layer(kernel, bias))
+        kernel, bias = layer_names(number)
+        layers.append(Layer(_array(arrays, kernel, (inputs, outputs)), _array(arrays, bias, (outputs,))))
     # The other half of the last layer is the spread of the actions, which only training needs.
     layers[-1] = Layer(layers[-1].kernel[:, :ACTION_SIZE], layers[-1].bias[:ACTION_SIZE])
     if len(arrays) != 2 * len(layers):
         raise UserError(f"{len(arrays)} arrays, but the network of the record has {2 * len(layers)}")
     return NumpyPolicy(views(record.network), tuple(layers), record, name)
+
+
+def layer_names(number: int) -> tuple[str, str]:
+    """Names of a layer's kernel and bias among the arrays of an agent."""
+    layer = f"params/Mlp_0/Dense_{number}"
+    return f"{layer}/kernel", f"{layer}/bias"
 
 
 def _shapes(network: NetworkConfig) -> list[tuple[int, int]]:
