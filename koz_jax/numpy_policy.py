@@ -17,6 +17,7 @@ from koz_jax.config import NetworkConfig
 from koz_jax.encoding import Views, views
 from koz_jax.errors import UserError
 from koz_jax.layout import as_observations, size
+from koz_jax.task_config import ScenarioConfig
 
 ACTION_SIZE = 3
 
@@ -83,6 +84,11 @@ def from_arrays(arrays: Mapping[str, np.ndarray], record: Record, name: str) -> 
     if len(arrays) != 2 * len(layers):
         raise UserError(f"{len(arrays)} arrays, but the network of the record has {2 * len(layers)}")
     return NumpyPolicy(views(record.network), tuple(layers), record, name)
+
+
+def told_zones(network: NetworkConfig, scenario: ScenarioConfig) -> int:
+    """Zones that an exported controller is told of: all there may be, of which the policy sees the nearest."""
+    return max(network.observed_zones, scenario.max_zones)
 
 
 def layer_names(number: int) -> tuple[str, str]:

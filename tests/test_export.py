@@ -1,5 +1,6 @@
 """Exported controllers: they decide as the agent does, alone and in the loop, and say what they are."""
 
+import dataclasses
 import re
 import shutil
 import subprocess
@@ -23,7 +24,7 @@ from koz_jax.export.golden import Golden, golden
 from koz_jax.export.library import STRICT, CLibrary
 from koz_jax.export.loop import HostController
 from koz_jax.export.metadata import as_text, describe, training_sha256
-from koz_jax.layout import LAYOUT, MEANING, SIZE
+from koz_jax.layout import SIZE, layout, meaning, size
 from koz_jax.rollout import CaseResult
 
 ACTION_RANGE = 2.0
@@ -153,6 +154,31 @@ def test_c_of_other_networks(hidden_sizes, tmp_path):
     np.testing.assert_allclose(CLibrary(tmp_path).decide(drawn.observation), drawn.action, rtol=0, atol=1e-6)
 
 
+@needs_compiler
+def test_exports_of_a_policy_that_sees_several_zones(tmp_path):
+    import onnxruntime
+
+    network = tiny.CONFIG.network.model_copy(update={"observed_zones": 3})
+    crowded = tiny.CONFIG.task.scenario.model_copy(update={"max_zones": 4})
+    other = tiny.untrained_agent(network=network)
+    other = dataclasses.replace(other, task=other.task.model_copy(update={"scenario": crowded}))
+    drawn = golden(other, 1000, seed=6)
+    assert drawn.situation.shape[1] == 12 + 4 * 4 and drawn.observation.shape[1] == size(3) == 26
+    absent = drawn.observation[:, 21] == np.float32(np.pi)
+    assert 0 < np.sum(absent) < 500
+    write_files(tmp_path, export(other, "c"))
+    library = CLibrary(tmp_path)
+    np.testing.assert_allclose(library.observe(drawn.situation), drawn.observation, rtol=0, atol=2e-5)
+    np.testing.assert_allclose(library.decide(drawn.observation), drawn.action, rtol=0, atol=1e-6)
+    subprocess.run(["make", "-s", "-C", tmp_path, "test"], check=True, capture_output=True)
+    session = onnxruntime.InferenceSession(export(other, "onnx")["koz_policy.onnx"])
+    action = session.run(["action"], {"observation": drawn.observation})[0]
+    np.testing.assert_allclose(action, drawn.action, rtol=0, atol=1e-6)
+    reloaded = jax.export.deserialize(bytearray(export(other, "stablehlo")["koz_policy.jax_export"]))
+    np.testing.assert_allclose(reloaded.call(drawn.observation), drawn.action, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(other.to_numpy().predict(drawn.observation), drawn.action, rtol=0, atol=1e-6)
+
+
 def test_onnx_decides_alike(session, vectors):
     action, torque = session.run(None, {"observation": vectors.observation})
     np.testing.assert_allclose(action, vectors.action, rtol=0, atol=1e-5 * ACTION_RANGE)
@@ -188,8 +214,8 @@ def test_every_export_carries_its_metadata(agent, session, c_folder):
     texts = [files["koz_policy.mlir"].decode(), *((c_folder / f"koz_policy.{kind}").read_text() for kind in "ch")]
     for text in texts:
         flat = " ".join(re.sub(r"\n *(\*|//)? *", " ", text[:4000]).split())
-        for name in LAYOUT:
-            assert f"{name}: {MEANING[name]}" in flat
+        for name in layout():
+            assert f"{name}: {meaning(name)}" in flat
         assert metadata.training_sha256 in flat and metadata.weights_sha256 in flat
         assert "torque 2 N m" in flat and agent.provenance.command in flat
     for described in (session.get_modelmeta().custom_metadata_map["koz_jax"], files["koz_policy.json"]):
@@ -217,7 +243,8 @@ def test_the_command_line(capsys, tmp_path):
     tiny.untrained_agent().save(tmp_path / "agent")
     assert main([str(tmp_path / "agent"), "--to", "c", "--out", str(tmp_path / "new" / "c")]) == 0
     assert capsys.readouterr().out.split() == [
-        str(tmp_path / "new" / "c" / name) for name in ("koz_policy.h", "koz_policy.c", "koz_selftest.c", "Makefile")
+        str(tmp_path / "new" / "c" / name)
+        for name in ("koz_math.h", "koz_policy.h", "koz_policy.c", "koz_selftest.c", "Makefile")
     ]
     assert main(["nowhere", "--to", "c", "--out", str(tmp_path)]) == 2
     assert "error: agent: 'nowhere' is neither" in capsys.readouterr().err

@@ -151,7 +151,7 @@ def contents(folder: Path) -> dict[Path, bytes | None]:
 
 def untrained_agent(seed: int = 0, network: NetworkConfig = CONFIG.network) -> Agent:
     """An agent with random weights, for the task of ``CONFIG``."""
-    policy = policy_network(network).init(jax.random.key(seed), jnp.zeros(observation.SIZE))
+    policy = policy_network(network).init(jax.random.key(seed), jnp.zeros(observation.size(network.observed_zones)))
     provenance = Provenance(command="python train.py", seed=seed, phase=2, updates=128, table={"cases": 8, "name": "x"})
     return Agent(PolicyController(policy, network), CONFIG.task, provenance, "untrained")
 

@@ -93,9 +93,16 @@ def angle(q: np.ndarray) -> np.ndarray:
 
 
 def separation(q_BN: np.ndarray, boresight_B: np.ndarray, axis_N: np.ndarray) -> np.ndarray:
-    """Angle between the telescope and the zone's axis.  Returns (n,) [rad]."""
-    looking_N = np.array([RigidBodyKinematics.EP2C(q).T @ boresight_B for q in q_BN])
-    return np.arctan2(np.linalg.norm(np.cross(looking_N, axis_N), axis=1), np.sum(looking_N * axis_N, axis=1))
+    """Angles between the telescope and the zones' axes (n, zones, 3).  Returns (n, zones) [rad]."""
+    looking_N = np.array([RigidBodyKinematics.EP2C(q).T @ boresight_B for q in q_BN])[:, None]
+    return np.arctan2(np.linalg.norm(np.cross(looking_N, axis_N), axis=2), np.sum(looking_N * axis_N, axis=2))
+
+
+def with_absent_zones(axis_N: np.ndarray, half_angle: np.ndarray, zones: int) -> tuple[np.ndarray, np.ndarray]:
+    """Fill up to as many zones as the controller wants to be told of.  axis_N: (n, some, 3); half_angle: (n, some)."""
+    count, some = half_angle.shape
+    absent = np.tile([1.0, 0.0, 0.0], (count, zones - some, 1)), np.full((count, zones - some), -np.pi)
+    return np.concatenate([axis_N, absent[0]], axis=1), np.concatenate([half_angle, absent[1]], axis=1)
 
 
 def compare_tumbles(data: dict[str, np.ndarray]) -> bool:
@@ -124,17 +131,18 @@ def compare_cases(data: dict[str, np.ndarray], controller: CLibrary) -> bool:
     start = time.perf_counter()
     dt, steps = float(data["step_seconds"]), int(data["steps"])
     fleet = Fleet(data["q_BN"], data["omega_BN_B"], data["inertia"], dt)
-    half_angle, before = data["zone_half_angle"], None
+    axis_N, half_angle = with_absent_zones(data["zone_axis_N"], data["zone_half_angle"], controller.zones)
     margins, errors, effort = [], [], np.zeros(len(half_angle))
+    before = None
     for step in range(steps + 1):
         q_BN, omega = fleet.state()
         q_e = relative(data["q_DN"].astype(float), q_BN)
         errors.append(angle(q_e))
-        margins.append(separation(q_BN, data["boresight_B"], data["zone_axis_N"]) - half_angle)
+        margins.append(np.min(separation(q_BN, data["boresight_B"], axis_N) - half_angle, axis=1))
         if step == steps:
             break
         before = q_e[:, 0] if before is None else before
-        told = (q_BN, omega, data["q_DN"], data["zone_axis_N"], half_angle[:, None], before[:, None])
+        told = (q_BN, omega, data["q_DN"], axis_N.reshape(len(q_BN), -1), half_angle, before[:, None])
         torque_B = controller.torque(controller.observe(np.concatenate(told, axis=1)))
         before = q_e[:, 0]
         fleet.torque(torque_B)

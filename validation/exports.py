@@ -77,16 +77,16 @@ def verdicts(flown: CaseResult) -> str:
 
 def check(
     name: str,
-    decide: Callable[[np.ndarray], np.ndarray],
+    predict: Callable[[np.ndarray], np.ndarray],
     agent: Agent,
     flown: CaseResult,
     config: MonteCarloConfig,
 ) -> bool:
     """Print one exported controller beside the agent.  Returns whether they agree."""
     vectors = golden(agent, _OBSERVATIONS, seed=1)
-    difference = np.abs(decide(vectors.observation) - vectors.action).max() / _ACTION_RANGE
+    difference = np.abs(predict(vectors.observation) - vectors.action).max() / _ACTION_RANGE
     start = time.perf_counter()
-    found = evaluation.fly_cases(HostController(decide), agent.task, config)
+    found = evaluation.fly_cases(HostController(predict, agent.controller.network.observed_zones), agent.task, config)
     seconds = time.perf_counter() - start
     differing = np.flatnonzero((found.settled != flown.settled) | (found.violated != flown.violated))
     print(f"{name}: largest difference of an action over {_OBSERVATIONS} observations: {difference:.1e} of the range")

@@ -1,8 +1,4 @@
-"""C99 source of a controller: no allocation, fixed loops, constant weights, nothing beyond libm.
-
-``koz_torque`` in ``templates/koz_policy.c`` is the one place where torque leaves the controller: what guards it (a
-shield) belongs there.
-"""
+"""C99 source of a controller: no allocation, fixed loops, constants, nothing beyond libm."""
 
 import importlib.resources
 from collections.abc import Iterable
@@ -10,22 +6,26 @@ from collections.abc import Iterable
 import numpy as np
 
 from koz_jax.export.golden import Golden
-from koz_jax.export.metadata import as_text, describe
-from koz_jax.layout import SIZE
-from koz_jax.numpy_policy import ACTION_SIZE, NumpyPolicy
+from koz_jax.export.metadata import Metadata, as_text, describe
+from koz_jax.layout import size
+from koz_jax.numpy_policy import ACTION_SIZE, NumpyPolicy, told_zones
 
 # 1e-5 of the action's range, which is 2.
 _ACTION_TOLERANCE = "2e-5"
 _OBSERVATION_TOLERANCE = "2e-5"
-_TEMPLATES = ("koz_policy.h", "koz_policy.c", "koz_selftest.c", "Makefile")
+_TEMPLATES = ("koz_math.h", "koz_policy.h", "koz_policy.c", "koz_selftest.c", "Makefile")
 
 
 def c_files(policy: NumpyPolicy, vectors: Golden) -> dict[str, bytes]:
-    """Header, source, self-test with golden vectors, and Makefile, by file name."""
+    """Headers, source, self-test with golden vectors, and Makefile, by file name."""
     metadata = describe(policy)
+    network = metadata.network
+    zones = told_zones(network, metadata.task.scenario)
     replacements = {
-        "HEAD": "\n".join(f" * {line}".rstrip() for line in as_text(metadata).splitlines()),
-        "OBSERVATION_SIZE": str(SIZE),
+        "HEAD": _head(metadata),
+        "OBSERVATION_SIZE": str(size(network.observed_zones)),
+        "ZONES": str(zones),
+        "OBSERVED_ZONES": str(network.observed_zones),
         "ACTION_SIZE": str(ACTION_SIZE),
         "TORQUE_LIMIT": _number(metadata.torque_limit),
         "STEP_SECONDS": _number(metadata.step_seconds),
@@ -38,11 +38,15 @@ def c_files(policy: NumpyPolicy, vectors: Golden) -> dict[str, bytes]:
         "COUNT": str(len(vectors.action)),
         "ACTION_TOLERANCE": _ACTION_TOLERANCE,
         "OBSERVATION_TOLERANCE": _OBSERVATION_TOLERANCE,
-        "SITUATIONS": ",\n".join(_situation(row) for row in vectors.situation),
+        "SITUATIONS": ",\n".join(_situation(row, zones) for row in vectors.situation),
         "OBSERVATIONS": _rows(vectors.observation),
         "ACTIONS": _rows(vectors.action),
     }
     return {name: _fill(name, replacements).encode() for name in _TEMPLATES}
+
+
+def _head(metadata: Metadata) -> str:
+    return "\n".join(f" * {line}".rstrip() for line in as_text(metadata).splitlines())
 
 
 def _fill(name: str, replacements: dict[str, str]) -> str:
@@ -62,13 +66,18 @@ def _row(values: Iterable[float]) -> str:
 
 
 def _rows(table: np.ndarray) -> str:
-    return ",\n".join(f"    {{{_row(row)}}}" for row in table)
+    return ",\n".join(f"    {_braced(row)}" for row in table)
 
 
-def _situation(row: np.ndarray) -> str:
-    q_BN, omega, q_DN, axis, rest = np.split(row, (4, 7, 11, 14))
-    arrays = ", ".join(f"{{{_row(part)}}}" for part in (q_BN, omega, q_DN, axis))
-    return f"    {{{arrays}, {_row(rest)}}}"
+def _situation(row: np.ndarray, zones: int) -> str:
+    q_BN, omega, q_DN, axes, half_angles, before = np.split(row, np.cumsum([4, 3, 4, 3 * zones, zones]))
+    attitude = ", ".join(_braced(part) for part in (q_BN, omega, q_DN))
+    axis_rows = ", ".join(_braced(axis) for axis in axes.reshape(zones, 3))
+    return f"    {{{attitude}, {{{axis_rows}}}, {_braced(half_angles)}, {_row(before)}}}"
+
+
+def _braced(values: Iterable[float]) -> str:
+    return f"{{{_row(values)}}}"
 
 
 def _weights(policy: NumpyPolicy) -> Iterable[str]:
@@ -94,8 +103,8 @@ def _decide(policy: NumpyPolicy) -> Iterable[str]:
     for number, (inputs, _) in enumerate(shapes):
         yield f"float x{number}[{inputs}];"
     yield "int i;"
-    yield f"for (i = 0; i < {SIZE}; i++) x0[i] = observation[i];"
-    at = SIZE
+    yield "for (i = 0; i < KOZ_OBSERVATION_SIZE; i++) x0[i] = observation[i];"
+    at = size(policy.record.network.observed_zones)
     for start, stop, scale in policy.views:
         seen = f"x0[{at} + i] = tanhf(observation[{start} + i] / {_number(scale)});"
         yield f"for (i = 0; i < {stop - start}; i++) {seen}"

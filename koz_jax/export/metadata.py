@@ -7,10 +7,10 @@ import textwrap
 from koz_jax import __version__
 from koz_jax.agent_files import Provenance, Record
 from koz_jax.config import NetworkConfig
-from koz_jax.layout import LAYOUT, MEANING, SLICES
+from koz_jax.layout import layout, meaning, slices
 from koz_jax.numpy_policy import NumpyPolicy
 from koz_jax.settings import Settings
-from koz_jax.task_config import TaskConfig
+from koz_jax.task_config import ScenarioConfig, TaskConfig
 
 
 class Entry(Settings):
@@ -27,9 +27,7 @@ class Metadata(Settings):
 
     name: str
     koz_jax_version: str = __version__
-    observation: tuple[Entry, ...] = tuple(
-        Entry(name=name, start=SLICES[name].start, size=LAYOUT[name], meaning=MEANING[name]) for name in LAYOUT
-    )
+    observation: tuple[Entry, ...]
     action: str = "three numbers in [-1, 1]; times torque_limit that is the torque in body axes [N m], held for a step"
     torque_limit: float
     step_seconds: float
@@ -44,8 +42,14 @@ class Metadata(Settings):
 def describe(policy: NumpyPolicy) -> Metadata:
     """Metadata of a policy."""
     record = policy.record
+    zones = record.network.observed_zones
+    where = slices(zones)
     return Metadata(
         name=policy.name,
+        observation=tuple(
+            Entry(name=name, start=where[name].start, size=size, meaning=meaning(name))
+            for name, size in layout(zones).items()
+        ),
         torque_limit=record.task.spacecraft.torque_limit,
         step_seconds=record.task.step_seconds,
         boresight_B=record.task.spacecraft.boresight,
@@ -84,7 +88,7 @@ def as_text(metadata: Metadata) -> str:
         f"Action: {metadata.action}.",
         f"Limits: torque {metadata.torque_limit:g} N m about each body axis; time step {metadata.step_seconds:g} s;"
         f" boresight {list(metadata.boresight_B)} in body axes; inertia {[list(r) for r in task.spacecraft.inertia]}"
-        f" kg m^2; trained for one zone of {task.scenario.min_half_angle_deg:g} to"
+        f" kg m^2; trained for {_count(task.scenario)} of {task.scenario.min_half_angle_deg:g} to"
         f" {task.scenario.max_half_angle_deg:g} deg half angle and maneuvers that start at rest"
         f" ({task.scenario.max_rate_deg:g} deg/s).",
         "",
@@ -94,6 +98,12 @@ def as_text(metadata: Metadata) -> str:
     ]
     wrapped = (piece for line in lines for piece in textwrap.wrap(line, 110, subsequent_indent="    ") or [""])
     return "\n".join(wrapped).replace("*/", "* /").replace("/*", "/ *").replace("\\", "/")
+
+
+def _count(scenario: ScenarioConfig) -> str:
+    if scenario.max_zones == 1:
+        return "one zone"
+    return f"{scenario.min_zones} to {scenario.max_zones} zones"
 
 
 def _entry_text(entry: Entry) -> str:

@@ -1,4 +1,4 @@
-"""ONNX graph of a controller: observation (batch, 16) to action (batch, 3) and torque (batch, 3) [N m]."""
+"""ONNX graph of a controller: observation (batch, entries) to action (batch, 3) and torque (batch, 3) [N m]."""
 
 from typing import Any
 
@@ -6,7 +6,6 @@ import numpy as np
 
 from koz_jax.errors import UserError
 from koz_jax.export.metadata import describe
-from koz_jax.layout import SIZE
 from koz_jax.numpy_policy import ACTION_SIZE, NumpyPolicy
 
 try:
@@ -51,7 +50,7 @@ def onnx_files(policy: NumpyPolicy) -> dict[str, bytes]:
         helper.make_graph(
             graph.nodes,
             "koz_policy",
-            inputs=[rows("observation", SIZE)],
+            inputs=[rows("observation", sum(entry.size for entry in metadata.observation))],
             outputs=[rows("action", ACTION_SIZE), rows("torque_B", ACTION_SIZE)],
             initializer=graph.constants,
         ),

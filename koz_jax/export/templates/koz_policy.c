@@ -3,9 +3,7 @@
  */
 #include "koz_policy.h"
 
-#include <math.h>
-
-static const float boresight_B[3] = {@BORESIGHT@};
+#include "koz_math.h"
 
 @WEIGHTS@
 
@@ -18,29 +16,6 @@ static void relative(const float a[4], const float b[4], float q[4])
     q[3] = a[0] * b[3] - a[3] * b[0] - a[1] * b[2] + a[2] * b[1];
 }
 
-static void cross(const float a[3], const float b[3], float c[3])
-{
-    c[0] = a[1] * b[2] - a[2] * b[1];
-    c[1] = a[2] * b[0] - a[0] * b[2];
-    c[2] = a[0] * b[1] - a[1] * b[0];
-}
-
-/* q (x) (0, v) (x) q*, with q = (q0, q_vec) */
-static void rotate(float q0, const float q_vec[3], const float v[3], float turned[3])
-{
-    float t[3], u[3];
-    int i;
-    cross(q_vec, v, t);
-    for (i = 0; i < 3; i++) t[i] *= 2.0f;
-    cross(q_vec, t, u);
-    for (i = 0; i < 3; i++) turned[i] = v[i] + q0 * t[i] + u[i];
-}
-
-static float norm(const float v[3])
-{
-    return sqrtf(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]);
-}
-
 float koz_start(const koz_situation *now)
 {
     float q_e[4];
@@ -48,30 +23,49 @@ float koz_start(const koz_situation *now)
     return q_e[0];
 }
 
+/* Unit vector from the boresight towards a zone's axis; zero where the two coincide. */
+static void zone_direction(const koz_situation *now, int zone, float direction_B[3])
+{
+    float to_body[4], axis_B[3], distance;
+    int i;
+    koz_conjugate(now->q_BN, to_body);
+    koz_rotate(to_body, now->zone_axis_N[zone], axis_B);
+    for (i = 0; i < 3; i++) direction_B[i] = axis_B[i] - koz_boresight_B[i];
+    distance = koz_norm(direction_B);
+    for (i = 0; i < 3; i++) direction_B[i] = distance > 0.0f ? direction_B[i] / distance : 0.0f;
+}
+
 void koz_observe(const koz_situation *now, float observation[KOZ_OBSERVATION_SIZE])
 {
-    const float inverse[3] = {-now->q_BN[1], -now->q_BN[2], -now->q_BN[3]};
-    float axis_B[3], boresight_N[3], offset_B[3], difference_N[3], sum_N[3];
-    float distance, angle;
-    int i;
-    rotate(now->q_BN[0], inverse, now->zone_axis_N, axis_B);
-    rotate(now->q_BN[0], now->q_BN + 1, boresight_B, boresight_N);
-    for (i = 0; i < 3; i++) {
-        offset_B[i] = axis_B[i] - boresight_B[i];
-        difference_N[i] = boresight_N[i] - now->zone_axis_N[i];
-        sum_N[i] = boresight_N[i] + now->zone_axis_N[i];
-    }
-    distance = norm(offset_B);
-    angle = 2.0f * atan2f(norm(difference_N), norm(sum_N));
+    float angle[KOZ_ZONES], margin[KOZ_ZONES], boresight_N[3];
+    int seen[KOZ_ZONES];
+    int i, zone, place, nearest;
     relative(now->q_DN, now->q_BN, observation);
     for (i = 0; i < 3; i++) {
         observation[4 + i] = now->omega_BN_B[i];
-        observation[7 + i] = boresight_B[i];
-        observation[12 + i] = distance > 0.0f ? offset_B[i] / distance : 0.0f;
+        observation[7 + i] = koz_boresight_B[i];
     }
-    observation[10] = angle - now->zone_half_angle;
-    observation[11] = angle;
     observation[15] = now->q_e0_previous;
+    koz_rotate(now->q_BN, koz_boresight_B, boresight_N);
+    for (zone = 0; zone < KOZ_ZONES; zone++) {
+        angle[zone] = koz_angle(boresight_N, now->zone_axis_N[zone]);
+        margin[zone] = angle[zone] - now->zone_half_angle[zone];
+        seen[zone] = 0;
+    }
+    for (place = 0; place < KOZ_OBSERVED_ZONES; place++) {
+        float *part = observation + (place == 0 ? 10 : 11 + 5 * place);
+        nearest = -1;
+        for (zone = 0; zone < KOZ_ZONES; zone++)
+            if (!seen[zone] && (nearest < 0 || margin[zone] < margin[nearest])) nearest = zone;
+        seen[nearest] = 1;
+        part[0] = margin[nearest];
+        part[1] = angle[nearest];
+        zone_direction(now, nearest, part + 2);
+        if (place > 0 && now->zone_half_angle[nearest] <= 0.0f) {
+            part[0] = part[1] = koz_pi;
+            part[2] = part[3] = part[4] = 0.0f;
+        }
+    }
 }
 
 /* y = x kernel + bias */

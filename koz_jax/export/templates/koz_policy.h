@@ -5,20 +5,22 @@
 #define KOZ_POLICY_H
 
 #define KOZ_OBSERVATION_SIZE @OBSERVATION_SIZE@
+#define KOZ_ZONES @ZONES@ /* zones to be told of */
+#define KOZ_OBSERVED_ZONES @OBSERVED_ZONES@ /* of which the policy sees the nearest */
 #define KOZ_ACTION_SIZE @ACTION_SIZE@
 #define KOZ_TORQUE_LIMIT @TORQUE_LIMIT@ /* [N m] about each body axis */
 #define KOZ_STEP_SECONDS @STEP_SECONDS@ /* [s] between decisions; the torque is held in between */
 #define KOZ_TRAINING_SHA256 "@TRAINING_SHA256@"
 #define KOZ_WEIGHTS_SHA256 "@WEIGHTS_SHA256@"
 
-/* What the controller must be told.  All numbers must be finite, quaternions and the axis of unit length. */
+/* What the controller must be told.  All numbers must be finite, quaternions and axes of unit length. */
 typedef struct {
-    float q_BN[4];         /* attitude, body relative to inertial; scalar first, continuous in time (no jump to -q) */
-    float omega_BN_B[3];   /* [rad/s] rate of the body relative to inertial, in body axes */
-    float q_DN[4];         /* target attitude; of q_DN and -q_DN, the one for which q_e0 >= 0 at the start */
-    float zone_axis_N[3];  /* unit vector to the bright object, in inertial axes */
-    float zone_half_angle; /* [rad] */
-    float q_e0_previous;   /* observation[0] of the step before; at the start, of this step: see koz_start */
+    float q_BN[4];       /* attitude, body relative to inertial; scalar first, continuous in time (no jump to -q) */
+    float omega_BN_B[3]; /* [rad/s] rate of the body relative to inertial, in body axes */
+    float q_DN[4];       /* target attitude; of q_DN and -q_DN, the one for which q_e0 >= 0 at the start */
+    float zone_axis_N[KOZ_ZONES][3];  /* unit vectors to the bright objects, in inertial axes */
+    float zone_half_angle[KOZ_ZONES]; /* [rad]; -pi where there is no zone */
+    float q_e0_previous; /* observation[0] of the step before; at the start, of this step: see koz_start */
 } koz_situation;
 
 /* Scalar part of the attitude error: q_e0_previous of the first step. */
