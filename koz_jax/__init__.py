@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from koz_jax.config import TrainConfig
     from koz_jax.errors import UserError
     from koz_jax.evaluation import MonteCarlo, fly_case, fly_scenario, monte_carlo
+    from koz_jax.numpy_policy import load_policy
     from koz_jax.presets import preset
     from koz_jax.summary import summarise, table
     from koz_jax.trainer import train
@@ -25,6 +26,7 @@ __all__ = [
     "fly_case",
     "fly_scenario",
     "load_agent",
+    "load_policy",
     "monte_carlo",
     "preset",
     "shipped_agents",
@@ -43,6 +45,7 @@ _HOME = {
     "fly_case": "evaluation",
     "fly_scenario": "evaluation",
     "monte_carlo": "evaluation",
+    "load_policy": "numpy_policy",
     "preset": "presets",
     "summarise": "summary",
     "table": "summary",

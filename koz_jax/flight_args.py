@@ -19,7 +19,7 @@ class FlightArgs:
     """Fly random cases."""
 
     agent: str = "phase2"
-    """A shipped agent by name (phase1, phase2), or the folder of a run or of an agent."""
+    """A shipped agent by name (phase1, phase2), the folder of a run or of an agent, or a Stable-Baselines3 SAC zip."""
     controller: str | None = None
     """Fly this on the agent's task in place of the agent: pd, potential, sliding, planner; or one that does its worst:
     random, bang_bang, adversary, spin_up."""

@@ -1,13 +1,4 @@
-"""The observation (Eq. 6 of the paper), declared once: sizes, slices and plots derive from ``layout``.
-
-The paper has one zone, whose entries are the first 16.  Where there are several, the nearest comes first, and a
-policy that was trained for n zones sees the n nearest: the paper's 16 entries, then five for each zone after the first.
-"""
-
-import functools
-import itertools
-from collections.abc import Mapping
-from types import MappingProxyType
+"""The observation (Eq. 6 of the paper) of a state, packed in the order of ``layout``."""
 
 import jax
 import jax.numpy as jnp
@@ -15,49 +6,9 @@ import jax.numpy as jnp
 from koz_jax import env, keep_out, rotations
 from koz_jax.env import EnvParams, EnvState
 from koz_jax.keep_out import KeepOutZone
+from koz_jax.layout import LAYOUT, SIZE, SLICES, layout, size, slices, zone_part
 
-_ZONE = {
-    "zone_margin": 1,  # [rad] theta_margin
-    "zone_angle": 1,  # [rad] theta
-    "zone_direction_B": 3,  # unit vector from the boresight towards the zone's axis
-}
-
-
-@functools.cache
-def layout(zones: int = 1) -> Mapping[str, int]:
-    """Names and sizes of the parts, in order, for a policy that sees so many zones."""
-    first = {
-        "q_e": 4,  # attitude relative to the target
-        "omega_BN_B": 3,  # [rad/s]
-        "boresight_B": 3,  # unit vector
-        **_ZONE,
-        "q_e0_previous": 1,  # scalar part of q_e one step ago
-    }
-    further = {_zone_part(number, name): size for number in range(1, zones) for name, size in _ZONE.items()}
-    return MappingProxyType(first | further)
-
-
-def _zone_part(number: int, name: str) -> str:
-    return f"{number + 1}_{name}" if number else name
-
-
-def size(zones: int = 1) -> int:
-    """Entries of the observation."""
-    return sum(layout(zones).values())
-
-
-@functools.cache
-def slices(zones: int = 1) -> Mapping[str, slice]:
-    """Where each part is."""
-    parts = layout(zones)
-    ends = itertools.accumulate(parts.values())
-    return MappingProxyType({name: slice(end - parts[name], end) for name, end in zip(parts, ends, strict=True)})
-
-
-# The paper's observation.
-LAYOUT = layout()
-SIZE = size()
-SLICES = slices()
+__all__ = ["LAYOUT", "SIZE", "SLICES", "layout", "observe", "size", "slices"]
 
 
 def observe(state: EnvState, params: EnvParams, zones: int = 1) -> jax.Array:
@@ -74,7 +25,7 @@ def observe(state: EnvState, params: EnvParams, zones: int = 1) -> jax.Array:
     nearest = _nearest(state, params, zones)
     for number in range(zones):
         seen = _zone_parts(state, params, jax.tree.map(lambda leaf, i=number: leaf[i], nearest), masked=number > 0)
-        parts |= {_zone_part(number, name): value for name, value in seen.items()}
+        parts |= {zone_part(number, name): value for name, value in seen.items()}
     return jnp.concatenate([parts[name] for name in layout(zones)])
 
 

@@ -1,4 +1,7 @@
-"""Files that are whole or not there: checked arrays and JSON, written atomically, read without executing code."""
+"""Files that are whole or not there: checked arrays and JSON, written atomically, read without executing code.
+
+jax is imported by those functions only that need it, so that agents can be read without it.
+"""
 
 import contextlib
 import hashlib
@@ -11,8 +14,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from koz_jax.errors import UserError
@@ -202,13 +203,23 @@ def load_tree(folder: Path, template: Any) -> Any:
         UserError: the arrays are missing, damaged, or do not have the names, shapes and types of the template.
 
     """
+    return _from_arrays(read_arrays(folder), template, _whole(folder) / "arrays.npz")
+
+
+def read_arrays(folder: Path) -> dict[str, np.ndarray]:
+    """Read the arrays of a saved folder by their names, without jax.
+
+    Raises:
+        UserError: the arrays are missing or damaged.
+
+    """
     path = _whole(folder) / "arrays.npz"
     expected = read_record(folder).get("arrays_sha256")
     if not path.is_file():
         raise UserError(f"{path}: no such file")
     if _sha256(path) != expected:
         raise UserError(f"{path}: damaged: its checksum is not the one in record.json")
-    return _from_arrays(_read_arrays(path), template, path)
+    return _read_arrays(path)
 
 
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -228,16 +239,23 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 def named_leaves(tree: Any) -> dict[str, Any]:
     """Leaves by their path in the tree, such as ``learner/policy/params/kernel``."""
+    import jax
+
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
 def _is_key(leaf: Any) -> bool:
+    import jax
+    import jax.numpy as jnp
+
     return hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def key_data(tree: Any) -> Any:
     """Replace typed PRNG keys by their data."""
+    import jax
+
     return jax.tree.map(lambda leaf: jax.random.key_data(leaf) if _is_key(leaf) else leaf, tree)
 
 
@@ -250,6 +268,9 @@ def to_arrays(tree: Any) -> dict[str, np.ndarray]:
 
 
 def _from_arrays(arrays: dict[str, np.ndarray], template: Any, path: Path) -> Any:
+    import jax
+    import jax.numpy as jnp
+
     wanted = named_leaves(template)
     if wanted.keys() != arrays.keys():
         missing, extra = sorted(wanted.keys() - arrays.keys()), sorted(arrays.keys() - wanted.keys())

@@ -2,12 +2,9 @@
 
 import jax.numpy as jnp
 
-from koz_jax import observation
-from koz_jax.config import EncodingConfig
 from koz_jax.dynamics import Spacecraft
 from koz_jax.env import EnvParams
 from koz_jax.reward import RewardParams
-from koz_jax.sac.networks import Encoding
 from koz_jax.scenario import ScenarioRanges
 from koz_jax.task_config import ScenarioConfig, TaskConfig
 
@@ -53,12 +50,3 @@ def scenario_ranges(scenario: ScenarioConfig, min_angle_deg: float, max_angle_de
         min_zones=jnp.int32(scenario.min_zones),
         max_zones=scenario.max_zones,
     )
-
-
-def encoding(config: EncodingConfig, zones: int = 1) -> Encoding:
-    """Which slices of the observation (of so many zones) the networks also see at finer scales."""
-    slices = observation.slices(zones)
-    q_vec = slice(slices["q_e"].start + 1, slices["q_e"].stop)
-    parts = [(q_vec, config.attitude_scales), (slices["omega_BN_B"], config.rate_scales)]
-    parts += [(slices[name], config.zone_margin_scales) for name in slices if name.endswith("zone_margin")]
-    return tuple((part.start, part.stop, scale) for part, scales in parts for scale in scales)

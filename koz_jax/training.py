@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from koz_jax import curriculum, env, observation, reward, scenario, shield, task, watch
+from koz_jax import curriculum, encoding, env, observation, reward, scenario, shield, task, watch
 from koz_jax.config import TrainConfig
 from koz_jax.curriculum import Difficulty
 from koz_jax.env import EnvParams, EnvState
@@ -50,7 +50,7 @@ def make_sac(config: TrainConfig) -> Sac:
     """The learner's static settings."""
     return Sac(
         hidden_sizes=config.network.hidden_sizes,
-        encoding=task.encoding(config.network.encoding, config.network.observed_zones),
+        encoding=encoding.views(config.network),
         observation_size=observation.size(config.network.observed_zones),
         action_size=ACTION_SIZE,
         target_entropy=config.sac.target_entropy,

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import tiny
 
-import koz_jax.agent
-from koz_jax import observation, storage
+from koz_jax import agent_files, observation, storage
 from koz_jax.agent import Agent, find_agent, load_agent, shipped_agents
 from koz_jax.errors import UserError
 from koz_jax.run_folder import RunFolder
@@ -39,7 +38,7 @@ def shipped(agent, tmp_path, monkeypatch):
     for number, name in enumerate(["beta", "alpha"]):
         tiny.untrained_agent(number).save(tmp_path / "shipped" / name)
     (tmp_path / "shipped" / "empty").mkdir()
-    monkeypatch.setattr(koz_jax.agent, "shipped_folder", lambda: tmp_path / "shipped")
+    monkeypatch.setattr(agent_files, "shipped_folder", lambda: tmp_path / "shipped")
 
 
 def observations(count: int) -> np.ndarray:
@@ -117,7 +116,7 @@ def test_shipped_agents_are_found_by_name(monkeypatch, tmp_path):
 
 
 def test_a_package_without_agents_says_so(monkeypatch, tmp_path):
-    monkeypatch.setattr(koz_jax.agent, "shipped_folder", lambda: tmp_path / "nowhere")
+    monkeypatch.setattr(agent_files, "shipped_folder", lambda: tmp_path / "nowhere")
     assert shipped_agents() == ()
     with pytest.raises(UserError, match=r"agent: 'phase2' is neither a shipped agent \(there is none\)"):
         load_agent()

@@ -87,7 +87,9 @@ def test_only_the_training_modules_see_both_learning_and_physics():
     assert both <= {"koz_jax.training", "koz_jax.task", "koz_jax.refine"}
 
 
-@pytest.mark.parametrize("module", ["koz_jax", "koz_jax.config", "koz_jax.presets", "koz_jax.errors"])
+@pytest.mark.parametrize(
+    "module", ["koz_jax", "koz_jax.config", "koz_jax.presets", "koz_jax.errors", "koz_jax.numpy_policy"]
+)
 def test_importing_settings_costs_no_jax(module):
     heavy = ("jax", "flax", "optax", "brax", "matplotlib")
     code = f"import sys, {module}; print([name for name in {heavy} if name in sys.modules])"

@@ -20,7 +20,7 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from koz_jax import observation
 from koz_jax.agent import Agent, PolicyController, Provenance, policy_network
-from koz_jax.config import TrainConfig
+from koz_jax.config import NetworkConfig, TrainConfig
 from koz_jax.presets import preset
 from koz_jax.run_folder import RunFolder
 from koz_jax.trainer import train
@@ -155,10 +155,9 @@ def contents(folder: Path) -> dict[Path, bytes | None]:
     return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
 
 
-def untrained_agent(seed: int = 0) -> Agent:
+def untrained_agent(seed: int = 0, network: NetworkConfig = CONFIG.network) -> Agent:
     """An agent with random weights, for the task of ``CONFIG``."""
-    network = CONFIG.network
-    policy = policy_network(network).init(jax.random.key(seed), jnp.zeros(observation.SIZE))
+    policy = policy_network(network).init(jax.random.key(seed), jnp.zeros(observation.size(network.observed_zones)))
     provenance = Provenance(command="python train.py", seed=seed, phase=2, updates=128, table={"cases": 8, "name": "x"})
     return Agent(PolicyController(policy, network), CONFIG.task, provenance, "untrained")
 

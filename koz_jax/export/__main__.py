@@ -1,0 +1,87 @@
+"""Export a trained agent: ``python -m koz_jax.export``, ``python -m koz_jax.export --help`` for every setting."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from koz_jax.errors import UserError, exit_status
+
+if TYPE_CHECKING:
+    from koz_jax.agent import Agent
+
+GOLDEN_VECTORS = 100
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportArgs:
+    """Write a trained agent as C99 source, ONNX, or StableHLO."""
+
+    agent: Annotated[str, tyro.conf.Positional]
+    """A shipped agent by name (phase1, phase2), the folder of a run or of an agent, or a Stable-Baselines3 SAC zip."""
+    to: Literal["c", "onnx", "stablehlo"]
+    """c: C99 with a self-test; onnx: a graph for onnxruntime; stablehlo: a program for XLA and jax.export."""
+    out: Path
+    """Folder to write into; older files of an export are replaced."""
+
+
+def main(argv: list[str]) -> int:
+    """Export.  Returns the exit status."""
+    return exit_status(lambda: _export(tyro.cli(ExportArgs, args=argv, prog="python -m koz_jax.export")))
+
+
+def _export(args: ExportArgs) -> int:
+    # jax is imported only now: --help and flags that do not exist are answered at once.
+    from koz_jax import storage
+    from koz_jax.agent import load_agent
+
+    storage.make_folder("out", args.out)
+    for path in write_files(args.out, export(load_agent(args.agent), args.to)):
+        print(path)
+    return 0
+
+
+def export(agent: Agent, to: Literal["c", "onnx", "stablehlo"]) -> dict[str, bytes]:
+    """Contents of the exported files by their names.
+
+    Raises:
+        UserError: a package that the format needs is not installed.
+
+    """
+    if to == "onnx":
+        from koz_jax.export.onnx import onnx_files
+
+        return onnx_files(agent.to_numpy())
+    if to == "stablehlo":
+        from koz_jax.export.stablehlo import stablehlo_files
+
+        return stablehlo_files(agent)
+    from koz_jax.export.c import c_files
+    from koz_jax.export.golden import golden
+
+    return c_files(agent.to_numpy(), golden(agent, GOLDEN_VECTORS))
+
+
+def write_files(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
+    """Write files, each in one step: readers see the old content or the new.  Returns their paths."""
+    paths = []
+    for name, content in files.items():
+        path, fresh = folder / name, folder / f".{name}.{os.getpid()}"
+        try:
+            fresh.write_bytes(content)
+            os.replace(fresh, path)
+        except OSError as error:
+            fresh.unlink(missing_ok=True)
+            raise UserError(f"out: {path} cannot be written: {error.strerror or error}") from None
+        paths.append(path)
+    return paths
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

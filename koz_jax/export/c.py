@@ -1,0 +1,118 @@
+"""C99 source of a controller: no allocation, fixed loops, constants, nothing beyond libm."""
+
+import importlib.resources
+from collections.abc import Iterable
+
+import numpy as np
+
+from koz_jax.export.golden import Golden
+from koz_jax.export.metadata import Metadata, as_text, describe
+from koz_jax.layout import size
+from koz_jax.numpy_policy import ACTION_SIZE, NumpyPolicy, told_zones
+
+# 1e-5 of the action's range, which is 2.
+_ACTION_TOLERANCE = "2e-5"
+_OBSERVATION_TOLERANCE = "2e-5"
+_TEMPLATES = ("koz_math.h", "koz_policy.h", "koz_policy.c", "koz_selftest.c", "Makefile")
+
+
+def c_files(policy: NumpyPolicy, vectors: Golden) -> dict[str, bytes]:
+    """Headers, source, self-test with golden vectors, and Makefile, by file name."""
+    metadata = describe(policy)
+    network = metadata.network
+    zones = told_zones(network, metadata.task.scenario)
+    replacements = {
+        "HEAD": _head(metadata),
+        "OBSERVATION_SIZE": str(size(network.observed_zones)),
+        "ZONES": str(zones),
+        "OBSERVED_ZONES": str(network.observed_zones),
+        "ACTION_SIZE": str(ACTION_SIZE),
+        "TORQUE_LIMIT": _number(metadata.torque_limit),
+        "STEP_SECONDS": _number(metadata.step_seconds),
+        "TRAINING_SHA256": metadata.training_sha256,
+        "WEIGHTS_SHA256": metadata.weights_sha256,
+        "BORESIGHT": _row(metadata.boresight_B),
+        "WEIGHTS": "\n\n".join(_weights(policy)),
+        "RELU": _RELU if len(policy.layers) > 1 else "",
+        "DECIDE": "\n".join(f"    {line}" for line in _decide(policy)),
+        "COUNT": str(len(vectors.action)),
+        "ACTION_TOLERANCE": _ACTION_TOLERANCE,
+        "OBSERVATION_TOLERANCE": _OBSERVATION_TOLERANCE,
+        "SITUATIONS": ",\n".join(_situation(row, zones) for row in vectors.situation),
+        "OBSERVATIONS": _rows(vectors.observation),
+        "ACTIONS": _rows(vectors.action),
+    }
+    return {name: _fill(name, replacements).encode() for name in _TEMPLATES}
+
+
+def _head(metadata: Metadata) -> str:
+    return "\n".join(f" * {line}".rstrip() for line in as_text(metadata).splitlines())
+
+
+def _fill(name: str, replacements: dict[str, str]) -> str:
+    text = (importlib.resources.files("koz_jax.export") / "templates" / name).read_text(encoding="utf-8")
+    for key, value in replacements.items():
+        text = text.replace(f"@{key}@", value)
+    return text
+
+
+def _number(value: float) -> str:
+    """The shortest float32 constant that reads back as the same bits."""
+    return f"{np.float32(value)}f"
+
+
+def _row(values: Iterable[float]) -> str:
+    return ", ".join(_number(value) for value in values)
+
+
+def _rows(table: np.ndarray) -> str:
+    return ",\n".join(f"    {_braced(row)}" for row in table)
+
+
+def _situation(row: np.ndarray, zones: int) -> str:
+    q_BN, omega, q_DN, axes, half_angles, before = np.split(row, np.cumsum([4, 3, 4, 3 * zones, zones]))
+    attitude = ", ".join(_braced(part) for part in (q_BN, omega, q_DN))
+    axis_rows = ", ".join(_braced(axis) for axis in axes.reshape(zones, 3))
+    return f"    {{{attitude}, {{{axis_rows}}}, {_braced(half_angles)}, {_row(before)}}}"
+
+
+def _braced(values: Iterable[float]) -> str:
+    return f"{{{_row(values)}}}"
+
+
+def _weights(policy: NumpyPolicy) -> Iterable[str]:
+    for number, layer in enumerate(policy.layers):
+        inputs, outputs = layer.kernel.shape
+        kernel = ",\n".join(f"    {_row(row)}" for row in layer.kernel)
+        yield f"static const float kernel_{number}[{inputs} * {outputs}] = {{\n{kernel}\n}};"
+        yield f"static const float bias_{number}[{outputs}] = {{{_row(layer.bias)}}};"
+
+
+_RELU = """static void relu(float *x, int size)
+{
+    int i;
+    for (i = 0; i < size; i++) x[i] = x[i] < 0.0f ? 0.0f : x[i];
+}
+
+"""
+
+
+def _decide(policy: NumpyPolicy) -> Iterable[str]:
+    """Body of ``koz_decide``: encode, layer by layer, tanh."""
+    shapes = [layer.kernel.shape for layer in policy.layers]
+    for number, (inputs, _) in enumerate(shapes):
+        yield f"float x{number}[{inputs}];"
+    yield "int i;"
+    yield "for (i = 0; i < KOZ_OBSERVATION_SIZE; i++) x0[i] = observation[i];"
+    at = size(policy.record.network.observed_zones)
+    for start, stop, scale in policy.views:
+        seen = f"x0[{at} + i] = tanhf(observation[{start} + i] / {_number(scale)});"
+        yield f"for (i = 0; i < {stop - start}; i++) {seen}"
+        at += stop - start
+    for number, (inputs, outputs) in enumerate(shapes):
+        last = number == len(shapes) - 1
+        into = "action" if last else f"x{number + 1}"
+        yield f"dense(x{number}, {inputs}, kernel_{number}, bias_{number}, {outputs}, {into});"
+        if not last:
+            yield f"relu({into}, {outputs});"
+    yield "for (i = 0; i < KOZ_ACTION_SIZE; i++) action[i] = tanhf(action[i]);"

@@ -1,0 +1,72 @@
+"""Fly the exported C source from Python: compile it, load it, ask it.  Needs a C compiler; imports no jax."""
+
+import ctypes
+import re
+import subprocess
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from koz_jax.errors import UserError
+from koz_jax.numpy_policy import ACTION_SIZE
+
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
+
+
+class CLibrary:
+    """The functions of an exported ``koz_policy.c`` over batches of rows."""
+
+    def __init__(self, folder: Path | str, compiler: str = "cc") -> None:
+        """Compile and load.
+
+        folder: where ``python -m koz_jax.export AGENT --to c`` has written.
+
+        Raises:
+            UserError: there is no exported source, or it cannot be compiled.
+
+        """
+        source = Path(folder) / "koz_policy.c"
+        if not source.is_file():
+            raise UserError(f"folder: {folder} holds no koz_policy.c; python -m koz_jax.export AGENT --to c makes one")
+        with tempfile.TemporaryDirectory() as built:
+            library = Path(built) / "koz_policy.so"
+            command = [compiler, *STRICT, "-O2", "-shared", "-fPIC", "-o", str(library), str(source), "-lm"]
+            try:
+                done = subprocess.run(command, capture_output=True, text=True, check=False)
+            except OSError as error:
+                raise UserError(f"compiler: {compiler!r} cannot be run: {error.strerror}") from None
+            if done.returncode:
+                raise UserError(f"compiler: {compiler!r} refuses {source}: {done.stderr.strip()}")
+            self._functions = ctypes.CDLL(str(library))
+        header = (Path(folder) / "koz_policy.h").read_text(encoding="utf-8")
+        self.zones, self._observation_size = (
+            int(re.findall(rf"#define {name} (\d+)", header)[0]) for name in ("KOZ_ZONES", "KOZ_OBSERVATION_SIZE")
+        )
+        for name in ("koz_observe", "koz_decide", "koz_torque"):
+            getattr(self._functions, name).argtypes = (ctypes.c_void_p, ctypes.c_void_p)
+            getattr(self._functions, name).restype = None
+
+    def observe(self, situations: np.ndarray) -> np.ndarray:
+        """Observations (batch, entries) of situations (batch, 12 + 4 zones): ``koz_situation`` field by field."""
+        return self._rows("koz_observe", situations, 12 + 4 * self.zones, self._observation_size)
+
+    def decide(self, observations: np.ndarray) -> np.ndarray:
+        """Actions (batch, 3) in [-1, 1] for observations (batch, entries)."""
+        return self._rows("koz_decide", observations, self._observation_size, ACTION_SIZE)
+
+    def torque(self, observations: np.ndarray) -> np.ndarray:
+        """Torques (batch, 3) [N m] in body axes for observations (batch, entries)."""
+        return self._rows("koz_torque", observations, self._observation_size, ACTION_SIZE)
+
+    def _rows(self, name: str, inputs: np.ndarray, entries: int, size: int) -> np.ndarray:
+        function = getattr(self._functions, name)
+        rows = np.ascontiguousarray(inputs, np.float32)
+        if rows.ndim != 2 or rows.shape[1] != entries:
+            raise UserError(f"{name}: its input must have shape (batch, {entries}), got {rows.shape}")
+        outputs = np.empty((len(rows), size), np.float32)
+        # Addresses of rows, because making a view of each would take longer than the controller does.
+        source, target = rows.ctypes.data, outputs.ctypes.data
+        for index in range(len(rows)):
+            function(source + index * rows.strides[0], target + index * outputs.strides[0])
+        return outputs

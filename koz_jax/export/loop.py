@@ -1,0 +1,30 @@
+"""Exported controllers in the loop: what runs outside of jax, flown by the Monte Carlo of the core."""
+
+from collections.abc import Callable
+
+import jax
+import numpy as np
+from flax import struct
+
+from koz_jax import observation
+from koz_jax.controllers.base import Memoryless
+from koz_jax.env import EnvParams, EnvState
+from koz_jax.numpy_policy import ACTION_SIZE
+
+
+class HostController(Memoryless):
+    """A controller that asks a function of NumPy arrays at every step."""
+
+    predict: Callable[[np.ndarray], np.ndarray] = struct.field(pytree_node=False)
+    """Actions (batch, 3) in [-1, 1] for observations (batch, entries), float32."""
+    observed_zones: int = struct.field(pytree_node=False, default=1)
+
+    def decide(self, state: EnvState, params: EnvParams, memory: None) -> tuple[jax.Array, None]:
+        """Action (3,) in [-1, 1] for the state, by its observation."""
+        observed = observation.observe(state, params, self.observed_zones)
+        shape = jax.ShapeDtypeStruct((ACTION_SIZE,), np.float32)
+        return jax.pure_callback(self._ask, shape, observed, vmap_method="broadcast_all"), memory
+
+    def _ask(self, observed: np.ndarray) -> np.ndarray:
+        rows = np.asarray(observed).reshape(-1, observed.shape[-1])
+        return self.predict(rows).reshape(*observed.shape[:-1], ACTION_SIZE)

@@ -1,0 +1,53 @@
+"""StableHLO of a controller, through ``jax.export``."""
+
+from typing import Any
+
+import jax
+import jax.export
+import jax.numpy as jnp
+from jax.export import Exported
+
+from koz_jax.agent import Agent
+from koz_jax.errors import UserError
+from koz_jax.export.metadata import Metadata, as_text, describe
+from koz_jax.layout import size
+
+_PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
+
+
+def stablehlo_files(agent: Agent) -> dict[str, bytes]:
+    """Three files by name.
+
+    - ``koz_policy.mlir``: the program as text, observation (entries,) to action (3,), for any compiler of StableHLO.
+      The metadata are at its head.
+    - ``koz_policy.jax_export``: for ``jax.export.deserialize``, observations (batch, entries) to actions (batch, 3),
+      on all platforms.  It has no room for metadata; its ``fun_name`` holds the hash of the training's settings.
+    - ``koz_policy.json``: the metadata.
+
+    Raises:
+        UserError: a package that serialisation needs is not installed.
+
+    """
+    metadata = describe(agent.to_numpy())
+    entries = size(metadata.network.observed_zones)
+    (batch,) = jax.export.symbolic_shape("batch")
+    try:
+        serialised = _exported(agent, metadata, (batch, entries), _PLATFORMS).serialize()
+    except ImportError as error:
+        raise UserError(
+            f'to: stablehlo needs the package flatbuffers: pip install "koz_jax[stablehlo]" ({error})'
+        ) from None
+    head = "".join(f"// {line}".rstrip() + "\n" for line in as_text(metadata).splitlines())
+    return {
+        "koz_policy.mlir": (head + _exported(agent, metadata, (entries,), ("cpu",)).mlir_module()).encode(),
+        "koz_policy.jax_export": bytes(serialised),
+        "koz_policy.json": (metadata.model_dump_json(indent=2) + "\n").encode(),
+    }
+
+
+def _exported(agent: Agent, metadata: Metadata, shape: tuple[Any, ...], platforms: tuple[str, ...]) -> Exported:
+    def decide(observed: jax.Array) -> jax.Array:
+        return agent.controller.act(observed)
+
+    decide.__name__ = f"koz_policy_{metadata.training_sha256[:16]}"
+    return jax.export.export(jax.jit(decide), platforms=platforms)(jax.ShapeDtypeStruct(shape, jnp.float32))

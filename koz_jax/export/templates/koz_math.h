@@ -1,0 +1,62 @@
+/*
+ * Vectors and scalar-first quaternions, for koz_policy.c.
+ *
+@HEAD@
+ */
+#ifndef KOZ_MATH_H
+#define KOZ_MATH_H
+
+#include <math.h>
+
+static const float koz_pi = 3.14159265f;
+static const float koz_boresight_B[3] = {@BORESIGHT@};
+
+static inline float koz_dot(const float a[3], const float b[3])
+{
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+static inline float koz_norm(const float v[3])
+{
+    return sqrtf(koz_dot(v, v));
+}
+
+static inline void koz_cross(const float a[3], const float b[3], float c[3])
+{
+    c[0] = a[1] * b[2] - a[2] * b[1];
+    c[1] = a[2] * b[0] - a[0] * b[2];
+    c[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/* q (x) (0, v) (x) q*: with q_BN, body components to inertial ones */
+static inline void koz_rotate(const float q[4], const float v[3], float turned[3])
+{
+    float t[3], u[3];
+    int i;
+    koz_cross(q + 1, v, t);
+    for (i = 0; i < 3; i++) t[i] *= 2.0f;
+    koz_cross(q + 1, t, u);
+    for (i = 0; i < 3; i++) turned[i] = v[i] + q[0] * t[i] + u[i];
+}
+
+static inline void koz_conjugate(const float q[4], float conjugate[4])
+{
+    conjugate[0] = q[0];
+    conjugate[1] = -q[1];
+    conjugate[2] = -q[2];
+    conjugate[3] = -q[3];
+}
+
+/* Angle between two unit vectors [rad]. */
+static inline float koz_angle(const float a[3], const float b[3])
+{
+    float difference[3], sum[3];
+    int i;
+    for (i = 0; i < 3; i++) {
+        difference[i] = a[i] - b[i];
+        sum[i] = a[i] + b[i];
+    }
+    return 2.0f * atan2f(koz_norm(difference), koz_norm(sum));
+}
+
+#endif

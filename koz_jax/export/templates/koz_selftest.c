@@ -1,0 +1,68 @@
+/*
+ * Self-test: golden vectors that koz_jax computed, and the time per decision.
+ * make test, or: cc -std=c99 -O2 -o koz_selftest koz_policy.c koz_selftest.c -lm && ./koz_selftest
+ *
+@HEAD@
+ */
+#include <math.h>
+#include <stdio.h>
+#include <time.h>
+
+#include "koz_policy.h"
+
+#define COUNT @COUNT@
+#define DECISIONS 20000
+#define OBSERVATION_TOLERANCE @OBSERVATION_TOLERANCE@
+#define ACTION_TOLERANCE @ACTION_TOLERANCE@
+
+static const koz_situation situations[COUNT] = {
+@SITUATIONS@
+};
+
+static const float observations[COUNT][KOZ_OBSERVATION_SIZE] = {
+@OBSERVATIONS@
+};
+
+static const float actions[COUNT][KOZ_ACTION_SIZE] = {
+@ACTIONS@
+};
+
+/* Largest difference so far; not a number counts as the largest. */
+static double worse(double worst, float found, float expected)
+{
+    const double difference = fabs((double)found - (double)expected);
+    return difference <= worst ? worst : difference;
+}
+
+int main(void)
+{
+    double observed = 0.0, decided = 0.0, applied = 0.0, seconds;
+    float observation[KOZ_OBSERVATION_SIZE], action[KOZ_ACTION_SIZE], torque_B[KOZ_ACTION_SIZE], kept = 0.0f;
+    clock_t start;
+    int i, n, passed;
+    for (n = 0; n < COUNT; n++) {
+        koz_observe(&situations[n], observation);
+        for (i = 0; i < KOZ_OBSERVATION_SIZE; i++) observed = worse(observed, observation[i], observations[n][i]);
+        koz_decide(observations[n], action);
+        koz_torque(observations[n], torque_B);
+        for (i = 0; i < KOZ_ACTION_SIZE; i++) {
+            decided = worse(decided, action[i], actions[n][i]);
+            applied = worse(applied, torque_B[i], KOZ_TORQUE_LIMIT * actions[n][i]);
+        }
+    }
+    start = clock();
+    for (n = 0; n < DECISIONS; n++) {
+        koz_observe(&situations[n % COUNT], observation);
+        koz_torque(observation, torque_B);
+        kept += torque_B[0];
+    }
+    seconds = (double)(clock() - start) / (double)CLOCKS_PER_SEC;
+    passed = observed <= OBSERVATION_TOLERANCE && decided <= ACTION_TOLERANCE
+        && applied <= KOZ_TORQUE_LIMIT * ACTION_TOLERANCE && kept == kept;
+    printf("golden vectors: %d\n", COUNT);
+    printf("largest difference of an observation: %.2e (tolerance %.0e)\n", observed, OBSERVATION_TOLERANCE);
+    printf("largest difference of an action: %.2e (tolerance %.0e)\n", decided, ACTION_TOLERANCE);
+    printf("time per decision: %.2f us\n", 1e6 * seconds / DECISIONS);
+    printf("%s\n", passed ? "passed" : "FAILED");
+    return passed ? 0 : 1;
+}

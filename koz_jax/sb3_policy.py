@@ -1,0 +1,103 @@
+"""Policies of Stable-Baselines3: read the weights of a SAC zip without executing anything in it.
+
+Of a zip, only the weights are read (by torch, which refuses anything else) and the plain text of its settings, never
+the pickles in them.  What cannot be seen there is taken for granted: the observation is ours, in our order
+(``layout.LAYOUT``), not normalised by a wrapper such as VecNormalize, and the task is the paper's.
+"""
+
+import json
+import re
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from koz_jax.agent_files import Provenance, Record
+from koz_jax.config import NO_ENCODING, NetworkConfig
+from koz_jax.errors import UserError
+from koz_jax.layout import SIZE
+from koz_jax.numpy_policy import ACTION_SIZE, layer_names
+from koz_jax.task_config import TaskConfig
+
+_LAYER = re.compile(r"actor\.latent_pi\.(\d+)\.weight")
+
+
+def is_sb3(name: str | Path) -> bool:
+    """Whether a name is that of a zip of Stable-Baselines3, and not of an agent of ours."""
+    return Path(name).suffix == ".zip"
+
+
+def read_sb3(path: str | Path) -> tuple[Record, dict[str, np.ndarray]]:
+    """Record and arrays as those of an agent's folder.
+
+    Raises:
+        UserError: it is no SAC policy for our observation and action, or torch is not installed.
+
+    """
+    weights = _read(Path(path))
+    # Layers are numbered together with the activations between them.
+    numbers = sorted(int(found[1]) for name in weights if (found := _LAYER.fullmatch(name)))
+    names = [f"actor.latent_pi.{number}" for number in numbers]
+    heads = ["actor.mu", "actor.log_std"]
+    expected = {f"{name}.{part}" for name in (*names, *heads) for part in ("weight", "bias")}
+    if weights.keys() != expected or numbers != list(range(0, 2 * len(numbers), 2)):
+        missing, extra = sorted(expected - weights.keys()), sorted(weights.keys() - expected)
+        raise UserError(
+            f"{path}: is no SAC policy of linear layers and ReLU: of its actor, {missing[:2] or 'nothing'} is missing"
+            f" and {extra[:2] or 'nothing'} is not known (gSDE, CNNs and other algorithms are not supported)"
+        )
+    kernels = [weights[f"{name}.weight"].T for name in names]
+    biases = [weights[f"{name}.bias"] for name in names]
+    kernels.append(np.concatenate([weights[f"{head}.weight"].T for head in heads], axis=1))
+    biases.append(np.concatenate([weights[f"{head}.bias"] for head in heads]))
+    _check_sizes(path, kernels)
+    arrays = {}
+    for number, (kernel, bias) in enumerate(zip(kernels, biases, strict=True)):
+        kernel_name, bias_name = layer_names(number)
+        arrays |= {kernel_name: np.ascontiguousarray(kernel, np.float32), bias_name: np.asarray(bias, np.float32)}
+    network = NetworkConfig(hidden_sizes=tuple(len(bias) for bias in biases[:-1]), encoding=NO_ENCODING)
+    provenance = Provenance(command=f"Stable-Baselines3, read from {Path(path).name}")
+    return Record(network=network, task=TaskConfig(), provenance=provenance), arrays
+
+
+def _check_sizes(path: str | Path, kernels: list[np.ndarray]) -> None:
+    if kernels[0].shape[0] != SIZE:
+        raise UserError(f"{path}: its observation must have {SIZE} numbers, got {kernels[0].shape[0]}")
+    if kernels[-1].shape[1] != 2 * ACTION_SIZE:
+        raise UserError(f"{path}: its action must have {ACTION_SIZE} numbers, got {kernels[-1].shape[1] // 2}")
+    if not all(np.all(np.isfinite(kernel)) for kernel in kernels):
+        raise UserError(f"{path}: its weights must be finite")
+
+
+def _read(path: Path) -> dict[str, np.ndarray]:
+    """Weights of the actor by name, after a look at the settings."""
+    try:
+        import torch
+    except ImportError as error:
+        raise UserError(f'agent: {path} needs torch to be read: pip install "koz_jax[sb3]" ({error})') from None
+    try:
+        with zipfile.ZipFile(path) as archive:
+            _check_settings(path, json.loads(archive.read("data")))
+            with archive.open("policy.pth") as file:
+                weights = torch.load(file, map_location="cpu", weights_only=True)
+            return {name: leaf.numpy() for name, leaf in weights.items() if name.startswith("actor.")}
+    except FileNotFoundError:
+        raise UserError(f"agent: {path}: no such file") from None
+    except UserError:
+        raise
+    except Exception as error:  # what torch raises for a file that it cannot read is not documented
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UserError(f"{path}: cannot be read as a zip of Stable-Baselines3: {reason}") from None
+
+
+def _check_settings(path: Path, settings: dict[str, Any]) -> None:
+    """Refuse what the weights do not show: another activation, actions that are not -1 to 1."""
+    activation = (settings.get("policy_kwargs") or {}).get("activation_fn")
+    if activation is not None and not str(activation).endswith(".ReLU'>"):
+        raise UserError(f"{path}: its activation function must be ReLU, got {activation}")
+    space = settings.get("action_space") or {}
+    for bound, allowed in (("low", -1.0), ("high", 1.0)):
+        found = [float(number) for number in str(space.get(bound, "")).strip("[] ").split()]
+        if any(number != allowed for number in found):
+            raise UserError(f"{path}: its actions must be from -1 to 1 (times the torque limit), got {bound} {found}")
