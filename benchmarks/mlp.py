@@ -6,8 +6,10 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from koz_jax import evaluation
+from koz_jax import evaluation, observation
 from koz_jax.agent import ACTION_SIZE
+from koz_jax.controllers.base import Memoryless
+from koz_jax.env import EnvParams, EnvState
 from koz_jax.evaluation import MonteCarloConfig
 from koz_jax.summary import Summary, summarise
 from koz_jax.task_config import TaskConfig
@@ -16,7 +18,7 @@ from koz_jax.task_config import TaskConfig
 _EVAL_SEED = 3_141_592_653
 
 
-class MlpController(struct.PyTreeNode):
+class MlpController(Memoryless):
     """tanh of a network's first outputs, on normalised observations: the deterministic policy of all of them."""
 
     mean: jax.Array  # (16,)
@@ -31,6 +33,10 @@ class MlpController(struct.PyTreeNode):
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             hidden = self.activation(hidden @ weight + bias)
         return jnp.tanh(hidden @ self.weights[-1] + self.biases[-1])[:ACTION_SIZE]
+
+    def decide(self, state: EnvState, params: EnvParams, memory: None) -> tuple[jax.Array, None]:
+        """Action (3,) in [-1, 1] for the state, by its observation."""
+        return self.act(observation.observe(state, params)), memory
 
 
 def judge(controller: MlpController, task_config: TaskConfig, cases: int, seed: int = _EVAL_SEED) -> Summary:

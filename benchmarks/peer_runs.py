@@ -24,9 +24,9 @@ from peer_record import OutOfTimeError, Point, Recorder, rate
 
 from koz_jax import evaluation, load_agent, observation, training
 from koz_jax.config import NetworkConfig
+from koz_jax.controllers.base import Controller
 from koz_jax.evaluation import MonteCarloConfig
 from koz_jax.presets import preset
-from koz_jax.rollout import Controller
 from koz_jax.sb3_env import ReorientationVecEnv
 from koz_jax.summary import Summary, summarise
 

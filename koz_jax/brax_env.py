@@ -51,7 +51,7 @@ class ReorientationEnv(Env):
         state = self._maneuvers.begin(_typed(rng))
         return State(
             pipeline_state=state,  # pyright: ignore[reportArgumentType]
-            obs=observation.observe(state, self._maneuvers.params),
+            obs=self._maneuvers.observe(state),
             reward=zero,
             done=zero,
             metrics={"zone_margin": zero, "pointing_error": zero},
@@ -65,7 +65,7 @@ class ReorientationEnv(Env):
         terms = reward.terms(outcome, params.reward, params.spacecraft.torque_limit)
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
             pipeline_state=after,
-            obs=observation.observe(after, params),
+            obs=self._maneuvers.observe(after),
             reward=reward.total(terms, reward.PAPER_WEIGHTS),
             metrics={
                 **state.metrics,
@@ -77,7 +77,7 @@ class ReorientationEnv(Env):
     @property
     def observation_size(self) -> int:
         """Entries of the observation."""
-        return observation.SIZE
+        return observation.size(self._maneuvers.ranges.max_zones)
 
     @property
     def action_size(self) -> int:

@@ -38,6 +38,10 @@ class Maneuvers(struct.PyTreeNode):
         """Begin a maneuver.  key: () typed, of this episode alone."""
         return env.reset(scenario.sample(key, self.ranges, self.params.spacecraft.boresight_B, self.rule))
 
+    def observe(self, state: EnvState) -> jax.Array:
+        """What is seen of all the zones that a scenario can have.  Returns (16,), 5 more for each zone above one."""
+        return observation.observe(state, self.params, self.ranges.max_zones)
+
 
 class VectorState(struct.PyTreeNode):
     """Environments under way; leaves have a leading axis of environments."""
@@ -95,7 +99,7 @@ def reset(flown: Maneuvers, key: jax.Array, episode: jax.Array) -> tuple[VectorS
     """
     begun = jax.vmap(flown.begin)(jax.vmap(jax.random.fold_in)(key, episode))
     margin = jax.vmap(_margin, in_axes=(None, 0))(flown, begun)
-    observed = jax.vmap(observation.observe, in_axes=(0, None))(begun, flown.params)
+    observed = jax.vmap(flown.observe)(begun)
     return VectorState(begun, key, episode, margin), observed
 
 
@@ -110,7 +114,7 @@ def step(flown: Maneuvers, state: VectorState, action: jax.Array) -> tuple[Vecto
     terms = jax.vmap(reward.terms, in_axes=(0, None, None))(outcome, params.reward, params.spacecraft.torque_limit)
     min_margin = jnp.minimum(state.min_margin, outcome.zone_margin)
     truncated = after.steps >= flown.episode_steps
-    final_observation = jax.vmap(observation.observe, in_axes=(0, None))(after, params)
+    final_observation = jax.vmap(flown.observe)(after)
     going_on = state.replace(maneuver=after, min_margin=min_margin)
 
     def restart() -> tuple[VectorState, jax.Array]:
@@ -197,7 +201,7 @@ def _keys(seeds: Sequence[int], num_envs: int) -> jax.Array:
 
 
 def observation_bounds(task_config: TaskConfig) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Bounds (16,) that no observation of a maneuver leaves, for code that wants a finite space.
+    """Bounds that no observation of a maneuver leaves, for code that wants a finite space.  Returns (low, high).
 
     Momentum grows by at most the torque's impulse; the rest are unit vectors, and angles of at most a half turn.
     """
@@ -205,10 +209,16 @@ def observation_bounds(task_config: TaskConfig) -> tuple[npt.NDArray[np.float32]
     moments = np.linalg.eigvalsh(np.array(spacecraft.inertia))
     start = np.sqrt(3.0) * np.deg2rad(task_config.scenario.max_rate_deg) * moments[-1]
     impulse = np.sqrt(3.0) * spacecraft.torque_limit * task_config.episode_seconds
-    high = np.ones(observation.SIZE)
-    high[observation.SLICES["omega_BN_B"]] = (start + impulse) / moments[0]
-    high[observation.SLICES["zone_angle"]] = np.pi
-    high[observation.SLICES["zone_margin"]] = np.pi - keep_out.NO_ZONE_HALF_ANGLE
+    limits = {
+        "omega_BN_B": (start + impulse) / moments[0],
+        "zone_angle": np.pi,
+        "zone_margin": np.pi - keep_out.NO_ZONE_HALF_ANGLE,
+    }
+    zones = task_config.scenario.max_zones
+    high = np.ones(observation.size(zones))
+    for name, part in observation.slices(zones).items():
+        # Further zones have a number in front of the name.
+        high[part] = next((limit for ending, limit in limits.items() if name.endswith(ending)), 1.0)
     # A little more, for what float32 rounds.
     high = (1.001 * high).astype(np.float32)
     return -high, high

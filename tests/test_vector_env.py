@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from koz_jax import env, observation, rollout, vector_env
+from koz_jax.controllers.base import Memoryless
 from koz_jax.dynamics import RigidBodyState
 from koz_jax.errors import UserError
 from koz_jax.keep_out import KeepOutZone
@@ -36,9 +37,9 @@ def test_environments_do_not_know_of_each_other():
 def test_an_episode_is_judged_as_the_monte_carlo_judges_it():
     """Violated: in a zone at some step of the episode, whatever the margin is now.  Settled: now."""
 
-    class Hold:
-        def act(self, observed):
-            return jnp.array([0.0, 0.0, -1.0])
+    class Hold(Memoryless):
+        def decide(self, state, params, memory):
+            return jnp.array([0.0, 0.0, -1.0]), memory
 
     flown = vector_env.maneuvers(SHORT)
     keys = jax.random.split(jax.random.key(0), 3)
@@ -105,7 +106,7 @@ def test_a_reset_without_seeds_goes_on_to_the_scenarios_that_autoreset_would_bri
         TaskConfig(),
         TaskConfig(
             spacecraft=SpacecraftConfig(inertia=((4.0, 0, 0), (0, 9.0, 0), (0, 0, 12.0)), torque_limit=5.0),
-            scenario=ScenarioConfig(max_rate_deg=5.0, infeasible_zone="shrink"),
+            scenario=ScenarioConfig(max_rate_deg=5.0, infeasible_zone="shrink", max_zones=3),
             episode_seconds=30.0,
         ),
     ],
@@ -119,7 +120,7 @@ def test_no_observation_leaves_its_bounds(task_config):
         # The same full torque all the time: nothing else spins the spacecraft up so much.
         def advance(state, _):
             state, _ = env.step(state, action, flown.params)
-            return state, observation.observe(state, flown.params)
+            return state, flown.observe(state)
 
         begun = flown.begin(key)
         return jax.lax.scan(advance, begun, None, length=flown.episode_steps)[1]
