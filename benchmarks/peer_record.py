@@ -1,7 +1,9 @@
 """What is measured of a peer: its declared result, and the clock that measures it."""
 
+import itertools
 import math
 import time
+from collections.abc import Sequence
 
 from mlp import MlpController, judge
 
@@ -47,7 +49,7 @@ class PeerResult(Settings):
     points: tuple[Point, ...]
     """Evaluations on the way."""
     updates_per_second: float | None
-    """Gradient updates per second at the paper's sizes; None where there were too few evaluations."""
+    """Gradient updates per second at the paper's sizes, in the best stretch; None with too few evaluations."""
     cases: int
     """Cases of the final Monte Carlo."""
     table: dict[str, float | None]
@@ -120,13 +122,11 @@ class Recorder:
             raise OutOfTimeError
 
 
-def rate(points: list[Point]) -> float | None:
-    """Gradient updates per second between the first and the last evaluation."""
+def rate(points: Sequence[Point]) -> float | None:
+    """Gradient updates per second in the best stretch between two evaluations, as others may use the machine too."""
     learning = [point for point in points if point.updates > 0]
-    if len(learning) < 2:
-        return None
-    first, last = learning[0], learning[-1]
-    return (last.updates - first.updates) / (last.seconds - first.seconds)
+    stretches = itertools.pairwise(learning)
+    return max(((b.updates - a.updates) / (b.seconds - a.seconds) for a, b in stretches), default=None)
 
 
 def rows(summary: Summary) -> dict[str, float | None]:

@@ -51,13 +51,15 @@ def _time(result: PeerResult, target: float) -> str:
 
 
 def _learning(report: Report) -> str:
-    header = ["", "updates/s", "updates done", "environment steps done", *(f"to {target:.0%}" for target in TARGETS)]
+    header = ["", "updates/s", "updates done", "environment steps done", "best success"]
+    header += [f"to {target:.0%}" for target in TARGETS]
     rows = [header]
     for result in report.results:
         speed = "-" if result.updates_per_second is None else f"{result.updates_per_second:.0f}"
         updates, steps = (max(getattr(point, name) for point in result.points) for name in ("updates", "env_steps"))
         times = [_time(result, target) for target in TARGETS]
-        rows.append([result.name, speed, f"{updates:,}", f"{steps:,}", *times])
+        best = max(point.success_rate for point in result.points)
+        rows.append([result.name, speed, f"{updates:,}", f"{steps:,}", f"{best:.1%}", *times])
     return _table(rows)
 
 
@@ -104,13 +106,13 @@ def _bound(report: Report) -> str:
 
 def markdown(report: Report) -> str:
     """The page."""
-    environment = [["environment alone, one jitted core behind", "steps/s"]]
+    environment = [["through", "environment steps/s"]]
     environment += [[name, f"{value:,.0f}"] for name, value in report.environment.items()]
     parts = [
         _INTRO.rstrip(),
         "## Learning\n\n" + _learning(report),
-        "Updates/s are with networks of 256-256 and batches of 256, environment steps included; for koz_jax measured"
-        " apart, because its preset has networks of 128-128. PPO's updates are of 512 unrolls of 20 steps, not of 256"
+        "Updates/s are with networks of 256-256 and batches of 256, environment steps included, in the best stretch"
+        " between two evaluations; for koz_jax measured apart, because its preset has networks of 128-128. PPO's updates are of 512 unrolls of 20 steps, not of 256"
         " transitions.",
         _bound(report),
         "## Monte Carlo after equal time\n\n" + _monte_carlo(report),

@@ -30,7 +30,7 @@ class Args:
     minutes: float = 5.0
     """Training time of each peer."""
     peers: tuple[str, ...] = NAMES
-    """Which peers to train now."""
+    """Which peers to train now; with none, only the tables are written anew."""
     cases: int = 10_000
     """Cases of the final Monte Carlo."""
     out: Path = Path("docs")
@@ -86,13 +86,13 @@ def main(args: Args) -> None:
         raise SystemExit(f"peers: unknown {', '.join(unknown)}; allowed: {', '.join(NAMES)}")
     saved = args.out / "peers.json"
     before = Report.model_validate_json(saved.read_text()) if saved.exists() else Report()
-    report = before.model_copy(update={"environment": adapters.rates()})
+    report = before.model_copy(update={"environment": adapters.rates()}) if args.peers else before
     for name in args.peers:
         print(name, flush=True)
         found = {result.name: result for result in report.results} | {name: in_process(name, args)}
         report = report.model_copy(update={"results": tuple(found[peer] for peer in NAMES if peer in found)})
         storage.write_text(saved, json.dumps(report.model_dump(mode="json"), indent=1) + "\n")
-        storage.write_text(args.out / "peers.md", markdown(report))
+    storage.write_text(args.out / "peers.md", markdown(report))
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from koz_jax.brax_env import ENV_NAME, wrap_for_training
 from koz_jax.errors import UserError
 from koz_jax.gym_env import ENV_ID, ReorientationEnv, ReorientationVectorEnv
 from koz_jax.sb3_env import ReorientationVecEnv
-from koz_jax.task_config import TaskConfig
+from koz_jax.task_config import ScenarioConfig, TaskConfig
 from koz_jax.vector_env import Fleet
 
 TASK = TaskConfig(episode_seconds=2.0)
@@ -209,6 +209,16 @@ def test_without_a_seed_every_environment_object_flies_something_else(make):
 def test_deviations_that_cannot_be_are_refused(make, options):
     with pytest.raises(UserError, match="angle_deg: must be"):
         make(**options)
+
+
+def test_every_adapter_shows_all_the_zones_that_a_scenario_can_have():
+    several = TaskConfig(scenario=ScenarioConfig(max_zones=3))
+    size = observation.size(3)
+    assert ReorientationEnv(several).observation_space.shape == (size,)
+    assert ReorientationVectorEnv(2, several).observation_space.shape == (2, size)
+    assert ReorientationVecEnv(2, several).observation_space.shape == (size,)
+    assert envs.get_environment(ENV_NAME, task_config=several).observation_size == size
+    assert Fleet(3, several).reset([0, 1, 2]).shape == (3, size)
 
 
 def imports_of(path):

@@ -63,11 +63,12 @@ def test_what_brax_asks_of_jax_is_lent_and_taken_back(benchmark):
     np.testing.assert_array_equal(replicated["b"], [2])
 
 
-def test_the_update_rate_leaves_out_what_comes_before_the_first_update(benchmark):
+def test_the_update_rate_is_that_of_the_best_stretch_between_two_evaluations(benchmark):
     record = benchmark("peer_record")
 
     def point(seconds, updates):
         return record.Point(seconds=seconds, env_steps=1, updates=updates, success_rate=0.0, mean_reward=0.0)
 
-    assert record.rate([point(10, 0), point(20, 100), point(30, 300), point(40, 700)]) == 30.0
+    # What comes before the first evaluation that shows updates holds the compilation too.
+    assert record.rate([point(1, 0), point(2, 1000), point(12, 1300), point(17, 1500), point(37, 1600)]) == 40.0
     assert record.rate([point(10, 0), point(20, 100)]) is None
