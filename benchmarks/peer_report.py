@@ -112,8 +112,8 @@ def markdown(report: Report) -> str:
         _INTRO.rstrip(),
         "## Learning\n\n" + _learning(report),
         "Updates/s are with networks of 256-256 and batches of 256, environment steps included, in the best stretch"
-        " between two evaluations; for koz_jax measured apart, because its preset has networks of 128-128. PPO's updates are of 512 unrolls of 20 steps, not of 256"
-        " transitions.",
+        " between two evaluations; for koz_jax measured apart, because its preset has networks of 128-128."
+        " PPO's updates are of 512 unrolls of 20 steps, not of 256 transitions.",
         _bound(report),
         "## Monte Carlo after equal time\n\n" + _monte_carlo(report),
         "\\* settled cases only. Of each peer the best policy by its evaluations, in"
