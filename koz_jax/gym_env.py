@@ -7,6 +7,8 @@ Importing this module registers it::
     env = gymnasium.make("koz_jax/Reorientation-v0")
     envs = gymnasium.make_vec("koz_jax/Reorientation-v0", num_envs=1024)
 
+or, without the import, ``gymnasium.make("koz_jax.gym_env:koz_jax/Reorientation-v0")``.
+
 Both take ``task_config``, ``min_angle_deg`` and ``max_angle_deg`` (initial deviations are uniform between the two).
 A maneuver ends by ``truncated`` alone.  Environment i of a vector environment reset with ``seed`` flies the same
 scenarios as the single environment reset with ``seed + i``; every reset without a seed goes on to new ones.
