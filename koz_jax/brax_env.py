@@ -1,79 +1,83 @@
-"""The environment behind brax's ``Env`` contract.
+"""The environment behind brax's ``Env`` contract, registered as ``koz_jax_reorientation``.
 
 The core (``env``, ``observation``, ``reward``) does not need brax; this adapter is for code that speaks its contract.
+Give brax's trainers ``wrap_env_fn=wrap_for_training``: their own wrapper replays every environment's first scenario.
 """
 
 import contextlib
 import io
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from koz_jax import env, observation, reward, scenario, task
+from koz_jax import env, observation, reward
 from koz_jax.agent import ACTION_SIZE
 from koz_jax.env import EnvState
+from koz_jax.errors import UserError
 from koz_jax.task_config import TaskConfig
+from koz_jax.vector_env import choose, maneuvers
 
 # brax prints to stdout, while it is imported, which optional engines it could not find.
 with contextlib.redirect_stdout(io.StringIO()):
-    from brax.envs.base import Env, State
+    from brax import envs
+    from brax.envs.base import Env, State, Wrapper
+    from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
+
+ENV_NAME = "koz_jax_reorientation"
 
 
 class ReorientationEnv(Env):
     """One maneuver at a time: a fresh random scenario at every reset, the paper's reward at every step.
 
-    ``State.pipeline_state`` is the core's ``EnvState``.  A maneuver is cut after ``task.episode_steps`` steps:
-    ``done`` is then 1 and ``info["truncation"]`` is 1, because a cut is no termination.
+    ``State.pipeline_state`` is the core's ``EnvState``.  ``done`` stays 0: nothing but time ends a maneuver, and
+    in brax that is a wrapper's business.
     """
 
     def __init__(
         self, task_config: TaskConfig | None = None, min_angle_deg: float = 80.0, max_angle_deg: float = 180.0
     ) -> None:
         """Deviations are uniform between the two angles [deg]."""
-        self._task = task_config or TaskConfig()
-        self._params = task.env_params(self._task)
-        self._ranges = task.scenario_ranges(self._task.scenario, min_angle_deg, max_angle_deg)
+        self._maneuvers = maneuvers(task_config, min_angle_deg, max_angle_deg)
+
+    @property
+    def episode_steps(self) -> int:
+        """Steps of a maneuver, the ``episode_length`` of brax's trainers."""
+        return self._maneuvers.episode_steps
 
     def reset(self, rng: jax.Array) -> State:
         """Draw a scenario.  rng: () typed key, or (2,) uint32 as brax's own trainers pass it."""
-        key = rng if jnp.issubdtype(rng.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(rng)
-        drawn = scenario.sample(
-            key, self._ranges, self._params.spacecraft.boresight_B, self._task.scenario.infeasible_zone
-        )
         zero = jnp.zeros(())
-        state = env.reset(drawn)
+        state = self._maneuvers.begin(_typed(rng))
         return State(
             pipeline_state=state,  # pyright: ignore[reportArgumentType]
-            obs=observation.observe(state, self._params),
+            obs=self._maneuvers.observe(state),
             reward=zero,
             done=zero,
             metrics={"zone_margin": zero, "pointing_error": zero},
-            info={"truncation": zero},
         )
 
     def step(self, state: State, action: jax.Array) -> State:
         """Apply an action (3,) in [-1, 1]."""
+        params = self._maneuvers.params
         before: EnvState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
-        after, outcome = env.step(before, action, self._params)
-        terms = reward.terms(outcome, self._params.reward, self._params.spacecraft.torque_limit)
-        cut = (after.steps >= self._task.episode_steps).astype(jnp.float32)
+        after, outcome = env.step(before, action, params)
+        terms = reward.terms(outcome, params.reward, params.spacecraft.torque_limit)
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
             pipeline_state=after,
-            obs=observation.observe(after, self._params),
+            obs=self._maneuvers.observe(after),
             reward=reward.total(terms, reward.PAPER_WEIGHTS),
-            done=cut,
             metrics={
                 **state.metrics,
                 "zone_margin": outcome.zone_margin,
-                "pointing_error": reward.pointing_error(after.angle, self._params.reward),
+                "pointing_error": reward.pointing_error(after.angle, params.reward),
             },
-            info={**state.info, "truncation": cut},
         )
 
     @property
     def observation_size(self) -> int:
         """Entries of the observation."""
-        return observation.SIZE
+        return observation.size(self._maneuvers.ranges.max_zones)
 
     @property
     def action_size(self) -> int:
@@ -84,3 +88,59 @@ class ReorientationEnv(Env):
     def backend(self) -> str:
         """The physics is the package's own."""
         return "koz_jax"
+
+
+class ResampleWrapper(Wrapper):
+    """Over an environment with many episodes in step: where one is over, a new random scenario begins.
+
+    ``info["final_observation"]`` is what the step led to, also where ``obs`` is already the next episode's first.
+    Episode k of the environment with key r flies the scenario of ``fold_in(r, k)``.
+    """
+
+    def reset(self, rng: jax.Array) -> State:
+        """Begin.  rng: (n,) typed keys, or (n, 2) uint32."""
+        keys = _typed(rng)
+        episode = jnp.zeros(keys.shape, jnp.int32)
+        state = self.env.reset(_episode_keys(keys, episode))
+        kept = {"key": jax.random.key_data(keys), "episode": episode, "final_observation": state.obs}
+        return state.replace(info={**state.info, **kept})  # pyright: ignore[reportAttributeAccessIssue]
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Apply actions (n, 3)."""
+        begun: Any = state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+            done=jnp.zeros_like(state.done),
+            info={**state.info, "steps": jnp.where(state.done > 0, 0.0, state.info["steps"])},
+        )
+        after: Any = self.env.step(begun, action)
+        over = after.done > 0
+        episode = after.info["episode"] + over
+
+        def restart() -> tuple[Any, jax.Array]:
+            fresh: Any = self.env.reset(_episode_keys(_typed(after.info["key"]), episode))
+            return choose(over, (fresh.pipeline_state, fresh.obs), (after.pipeline_state, after.obs))
+
+        # Drawing scenarios costs more than a step, and most steps end no episode.
+        pipeline_state, obs = jax.lax.cond(jnp.any(over), restart, lambda: (after.pipeline_state, after.obs))
+        info = {**after.info, "episode": episode, "final_observation": after.obs}
+        return after.replace(pipeline_state=pipeline_state, obs=obs, info=info)
+
+
+def wrap_for_training(
+    env: Env, episode_length: int = 1000, action_repeat: int = 1, randomization_fn: Any = None
+) -> Wrapper:
+    """Batch, cut into episodes and resample; for the argument ``wrap_env_fn`` of brax's trainers."""
+    if randomization_fn is not None:
+        raise UserError(f"randomization_fn: this environment has no brax System to randomise, got {randomization_fn}")
+    return ResampleWrapper(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
+
+
+def _typed(rng: jax.Array) -> jax.Array:
+    return rng if jnp.issubdtype(rng.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(rng)
+
+
+def _episode_keys(keys: jax.Array, episode: jax.Array) -> jax.Array:
+    """Keys (n, 2) of episodes, untyped, as brax's wrappers want them.  keys: (n,) typed; episode: (n,)."""
+    return jax.random.key_data(jax.vmap(jax.random.fold_in)(keys, episode))
+
+
+envs.register_environment(ENV_NAME, ReorientationEnv)

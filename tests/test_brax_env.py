@@ -1,3 +1,4 @@
+import functools
 import subprocess
 import sys
 from typing import Any
@@ -6,13 +7,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from brax import envs
+from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 
 from koz_jax import env, observation, reward, task
-from koz_jax.brax_env import ReorientationEnv
+from koz_jax.brax_env import ENV_NAME, ReorientationEnv, wrap_for_training
+from koz_jax.errors import UserError
 from koz_jax.task_config import TaskConfig
 
 TASK = TaskConfig(episode_seconds=2.0)
 ENV = ReorientationEnv(TASK)
+
+
+@functools.cache
+def jitted(wrapped):
+    return jax.jit(wrapped.step)
 
 
 def test_import_is_silent():
@@ -45,9 +54,33 @@ def test_every_key_draws_another_scenario():
 
 
 @pytest.mark.parametrize("steps", [19, 20])
-def test_an_episode_is_truncated_at_its_length_and_not_before(steps):
-    def advance(state, _):
-        return ENV.step(state, jnp.zeros(ENV.action_size)), None
+def test_time_up_is_a_truncation_in_the_wrappers_of_brax_too(steps):
+    wrapped = EpisodeWrapper(VmapWrapper(ENV), ENV.episode_steps, action_repeat=1)
+    state: Any = wrapped.reset(jax.random.split(jax.random.PRNGKey(7), 2))
+    for _ in range(steps):
+        state = jitted(wrapped)(state, jnp.zeros((2, ENV.action_size)))
+    np.testing.assert_array_equal(state.done, [steps == 20] * 2)
+    np.testing.assert_array_equal(state.info["truncation"], state.done)
 
-    state, _ = jax.lax.scan(advance, ENV.reset(jax.random.key(7)), None, length=steps)
-    assert float(state.done) == float(state.info["truncation"]) == float(steps == 20)
+
+def test_it_is_registered():
+    made: Any = envs.get_environment(ENV_NAME, task_config=TASK)
+    assert isinstance(made, ReorientationEnv) and made.episode_steps == 20
+
+
+def test_episodes_shorter_than_the_maneuver_are_counted_from_each_reset():
+    wrapped = wrap_for_training(ENV, episode_length=6, action_repeat=2)
+    state: Any = wrapped.reset(jax.random.split(jax.random.PRNGKey(8), 2))
+    done, steps = [], []
+    for _ in range(7):
+        state = jitted(wrapped)(state, jnp.zeros((2, ENV.action_size)))
+        done.append(float(state.done[0]))
+        steps.append(float(state.info["steps"][0]))
+    assert done == [0, 0, 1, 0, 0, 1, 0]
+    assert steps == [2, 4, 6, 2, 4, 6, 2]
+    np.testing.assert_array_equal(state.info["episode"], [2, 2])
+
+
+def test_randomisation_of_a_brax_system_is_refused():
+    with pytest.raises(UserError, match="randomization_fn: "):
+        wrap_for_training(ENV, randomization_fn=lambda system: system)

@@ -1,0 +1,44 @@
+"""Policies of other libraries as controllers of the Monte Carlo."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from koz_jax import evaluation, observation
+from koz_jax.agent import ACTION_SIZE
+from koz_jax.controllers.base import Memoryless
+from koz_jax.env import EnvParams, EnvState
+from koz_jax.evaluation import MonteCarloConfig
+from koz_jax.summary import Summary, summarise
+from koz_jax.task_config import TaskConfig
+
+# Scenarios by which policies are compared while they learn; no training and no final table draws them.
+_EVAL_SEED = 3_141_592_653
+
+
+class MlpController(Memoryless):
+    """tanh of a network's first outputs, on normalised observations: the deterministic policy of all of them."""
+
+    mean: jax.Array  # (16,)
+    std: jax.Array  # (16,)
+    weights: tuple[jax.Array, ...]  # (inputs, outputs) each
+    biases: tuple[jax.Array, ...]  # (outputs,) each
+    activation: Callable[[jax.Array], jax.Array] = struct.field(pytree_node=False)
+
+    def act(self, observed: jax.Array) -> jax.Array:
+        """Action (3,) in [-1, 1] for an observation (16,)."""
+        hidden = (observed - self.mean) / self.std
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            hidden = self.activation(hidden @ weight + bias)
+        return jnp.tanh(hidden @ self.weights[-1] + self.biases[-1])[:ACTION_SIZE]
+
+    def decide(self, state: EnvState, params: EnvParams, memory: None) -> tuple[jax.Array, None]:
+        """Action (3,) in [-1, 1] for the state, by its observation."""
+        return self.act(observation.observe(state, params)), memory
+
+
+def judge(controller: MlpController, task_config: TaskConfig, cases: int, seed: int = _EVAL_SEED) -> Summary:
+    """Fly the Monte Carlo of the paper (80 to 180 deg)."""
+    return summarise(evaluation.fly_cases(controller, task_config, MonteCarloConfig(cases=cases, seed=seed)))
