@@ -30,6 +30,12 @@ class EvalArgs(FlightArgs):
     """Write a row per case."""
     partial: Path | None = None
     """Keep finished blocks of cases in this folder; the same command goes on from them when it was interrupted."""
+    coordinator: str | None = None
+    """Fly with other processes that share --partial: the address (host:port) of the first of them."""
+    processes: int = 1
+    """How many processes there are."""
+    process: int = 0
+    """The number of this one; number 0 writes the results."""
     figures: Path | None = None
     """Draw the Monte Carlo figures into this folder, as PNG and PDF (needs the extra viz)."""
     replay_case: int | None = None
@@ -48,11 +54,13 @@ def _evaluate(args: EvalArgs) -> int:
     from koz_jax import evaluation, runtime
 
     config = args.config(args.substeps)
-    _check_outputs(args)
     runtime.configure()
+    if args.coordinator is not None:
+        runtime.join(args.coordinator, args.processes, args.process)
     pilot = args.pilot()
     task = args.task(pilot)
     evaluation.check_feasible(task, config.max_angle_deg)
+    _check_outputs(args)  # last, since it makes a folder
     if args.replay_case is not None:
         _replay(pilot, task, config, args.replay_case, _history_path(args))
     else:
@@ -107,6 +115,8 @@ def _monte_carlo(pilot: Pilot, task: TaskConfig, config: MonteCarloConfig, args:
     from koz_jax.summary import summarise, table
 
     flown = blocks.run_cases(pilot, task, config, partial=args.partial)
+    if args.process > 0:
+        return
     summary = summarise(flown.results)
     print(table(summary, config.cases, args.name, args.shield))
     print(f"compiled in {flown.compile_s:.1f} s, flown in {flown.wall_s:.1f} s")

@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import os
 import shlex
 import sys
 import time
@@ -25,6 +26,10 @@ class RunArgs:
     """Begin with the learner and the replay buffer of a snapshot, or of another run."""
     cases: int = 10_000
     """Monte Carlo cases of the table at the end."""
+    devices: int = 1
+    """Divide the environments and the replay buffer among so many devices (not with --seeds)."""
+    seeds: int = 1
+    """Train so many seeds, from --seed on, each on a core of its own; the best by evaluation is the run's agent."""
 
 
 def parse(argv: list[str]) -> tuple[TrainConfig, RunArgs]:
@@ -33,6 +38,7 @@ def parse(argv: list[str]) -> tuple[TrainConfig, RunArgs]:
     first.add_argument("--preset", nargs="?", const="")
     first.add_argument("--resume", nargs="?", const="")
     first.add_argument("--cases", nargs="?")
+    first.add_argument("--devices", nargs="?")
     chosen, others = first.parse_known_args(argv)
     if chosen.preset is not None:
         others += ["--preset", chosen.preset]
@@ -41,6 +47,10 @@ def parse(argv: list[str]) -> tuple[TrainConfig, RunArgs]:
     config, args = flags.parse(preset("fast" if chosen.preset is None else chosen.preset), RunArgs(), argv, "train.py")
     if not 1 <= args.cases < 2**31:
         raise UserError(f"cases: must be from 1 to 2^31 - 1, got {args.cases}")
+    if not 1 <= args.seeds <= 1000:
+        raise UserError(f"seeds: must be from 1 to 1000, got {args.seeds}")
+    if args.devices < 1 or (args.devices > 1 and args.seeds > 1):
+        raise UserError(f"devices: must be 1 or more, and 1 with --seeds, got {args.devices}")
     return config, args
 
 
@@ -57,18 +67,42 @@ def _train(config: TrainConfig, args: RunArgs) -> int:
     from koz_jax.trainer import train
 
     run = args.resume or args.run or Path("runs", time.strftime(f"{config.preset}-seed{config.seed}-%Y%m%d-%H%M%S"))
+    if args.seeds > 1 or (args.resume is not None and os.path.isfile(run / "seeds.json")):
+        return _train_seeds(config, args, run)
     runtime.configure()
     if args.resume:
         config = RunFolder(run).read_config()
-    agent = train(config, run, resume=args.resume is not None, start_from=args.start_from)
+    agent = train(config, run, resume=args.resume is not None, start_from=args.start_from, devices=args.devices)
     if agent is None:
-        print(f"stopped; go on with: python train.py --resume {shlex.quote(str(run))}", file=sys.stderr)
-        return 0
+        return _stopped(run)
     flown = evaluation.monte_carlo(agent, args.cases)
     summary = summarise(flown.results)
     storage.write_json(RunFolder(run).evaluation, evaluation.report(flown, summary))
     print(table(summary, args.cases, run.resolve().name))
     print(f"\nlook further: python eval_mc.py --agent {shlex.quote(str(run))} --csv cases.csv")
+    return 0
+
+
+def _stopped(run: Path) -> int:
+    print(f"stopped; go on with: python train.py --resume {shlex.quote(str(run))}", file=sys.stderr)
+    return 0
+
+
+def _train_seeds(config: TrainConfig, args: RunArgs, run: Path) -> int:
+    from koz_jax import runtime, seeds
+
+    runtime.configure()
+    if args.resume is None:
+        start_from = None if args.start_from is None else str(args.start_from.resolve())
+        plan = seeds.Plan(config=config, seeds=args.seeds, start_from=start_from)
+        seeds.begin(run, plan)
+    else:
+        plan = seeds.read_plan(run)
+    if not seeds.train_all(run, plan):
+        return _stopped(run)
+    best, judged = seeds.judge(run, plan, args.cases)
+    print(seeds.table(judged, args.cases))
+    print(f"\nthe best (seed {best.provenance.seed}): python eval_mc.py --agent {shlex.quote(str(run))}")
     return 0
 
 

@@ -16,6 +16,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.experimental import multihost_utils
 from tqdm import tqdm
 
 from koz_jax import evaluation, storage
@@ -54,7 +55,8 @@ def run_cases(
         pilot: who flies.
         task_config: what is flown.
         config: which cases.
-        partial: folder for finished blocks; those that are there already are not flown again.
+        partial: folder for finished blocks; those that are there already are not flown again.  Several processes
+            (see ``runtime.join``) need one that all of them see: each flies its share of the blocks.
         block: cases per block, a multiple of 500.
         progress: show a progress bar on stderr where there is more than one block.
 
@@ -63,18 +65,26 @@ def run_cases(
 
     """
     evaluation.check_feasible(task_config, config.max_angle_deg)
+    processes, process = jax.process_count(), jax.process_index()
+    if processes > 1 and partial is None:
+        raise UserError(f"partial: {processes} processes need a folder that all of them see, got none")
     parts = _parts(config, block)
+    mine = parts[process::processes]
     with ExitStack() as stack:
         if partial is not None:
             _check_folder(partial)
-            stack.enter_context(FolderLock(partial, "partial"))
-        bar = stack.enter_context(
-            tqdm(total=config.cases, unit="case", file=sys.stderr, disable=not progress or len(parts) == 1)
-        )
+            if process == 0:
+                stack.enter_context(FolderLock(partial, "partial"))
+        shown = progress and len(parts) > 1 and process == 0
+        cases = sum(part.cases for part in mine)
+        bar = stack.enter_context(tqdm(total=cases, unit="case", file=sys.stderr, disable=not shown))
         flown = []
-        for done in _fly(pilot, task_config, parts, partial):
+        for done in _fly(pilot, task_config, mine, partial):
             flown.append(done)
             bar.update(len(done.results.settled))
+        if processes > 1:
+            multihost_utils.sync_global_devices("all cases are flown")
+            flown = list(_fly(pilot, task_config, parts, partial))  # all are there to be read
     results = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(done.results for done in flown))
     fresh = [done for done in flown if not done.kept]
     return MonteCarlo(

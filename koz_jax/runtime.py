@@ -5,6 +5,8 @@ from pathlib import Path
 
 import jax
 
+from koz_jax.errors import UserError
+
 
 def configure() -> None:
     """Use every CPU core as a device for evaluation, and keep compiled programs from one run to the next.
@@ -18,3 +20,25 @@ def configure() -> None:
         root = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
         jax.config.update("jax_compilation_cache_dir", str(root / "koz_jax" / "compiled"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+
+def join(coordinator: str, processes: int, process: int) -> None:
+    """Make this process one of several that work together, on this machine or on many.
+
+    Call after ``configure`` and before anything touches a device.
+
+    Args:
+        coordinator: address of the first process, as host:port.
+        processes: how many there are.
+        process: the number of this one.
+
+    Raises:
+        UserError: there is no such process, or the others are not found.
+
+    """
+    if not 0 <= process < processes:
+        raise UserError(f"process: must be from 0 to processes - 1 = {processes - 1}, got {process}")
+    try:
+        jax.distributed.initialize(coordinator, processes, process)
+    except (RuntimeError, ValueError) as error:
+        raise UserError(f"coordinator: {coordinator} cannot be joined: {str(error).splitlines()[0]}") from None

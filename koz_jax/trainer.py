@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import koz_jax
-from koz_jax import curriculum, evaluation, memory, refine, reward, storage, training, watch
+from koz_jax import curriculum, evaluation, memory, refine, reward, sharding, storage, training, watch
 from koz_jax.agent import Agent, PolicyController, Provenance
 from koz_jax.config import TrainConfig
 from koz_jax.errors import UserError
@@ -41,6 +41,7 @@ def train(
     resume: bool = False,
     start_from: Path | str | None = None,
     progress: bool = True,
+    devices: int = 1,
 ) -> Agent | None:
     """Train an agent.
 
@@ -50,6 +51,7 @@ def train(
         resume: go on exactly where the run stopped.
         start_from: a snapshot (or the checkpoint of another run) whose learner and replay buffer to begin with.
         progress: show a progress bar on stderr.
+        devices: divide the environments and the replay buffer among so many devices.
 
     Returns:
         The best agent of the last phase, or None if the run was interrupted (its checkpoint is then up to date).
@@ -61,11 +63,12 @@ def train(
     if resume and start_from is not None:
         raise UserError(f"start_from: a resumed run goes on from its own checkpoint, got {start_from}")
     folder = RunFolder(Path(run))
+    sharding.check(config, devices)
     with StopRequest() as stop, _resumed(folder, config) if resume else _begun(folder, config, start_from) as saved:
         with Progress(config, saved.state.done, enabled=progress) as bar:
             bar.note(f"run folder: {folder.path}")
             with _memory_errors():
-                return _Run(config, folder, bar, stop).go(saved)
+                return _Run(config, folder, bar, stop, devices).go(saved)
 
 
 @contextlib.contextmanager
@@ -147,8 +150,9 @@ def score(results: CaseResult, config: TrainConfig, phase: int) -> float:
 class _Run:
     """One run under way; everything that survives it is in ``RunState`` and on disk."""
 
-    def __init__(self, config: TrainConfig, folder: RunFolder, bar: Progress, stop: StopRequest) -> None:
+    def __init__(self, config: TrainConfig, folder: RunFolder, bar: Progress, stop: StopRequest, devices: int) -> None:
         self.config = config
+        self.devices = devices
         self.folder = folder
         self.bar = bar
         self.stop = stop
@@ -220,7 +224,8 @@ class _Run:
         done = state.done
         end = self._chunk_end(done, self.config.log_every)
         steps = (end - done) // self.config.updates_per_step
-        train_state, metrics = training.train_chunk(self.config, state.train, jnp.int32(steps))
+        placed = sharding.place(state.train, self.devices)
+        train_state, metrics = training.train_chunk(self.config, placed, jnp.int32(steps))
         metrics = jax.device_get(metrics)
         watch.check(end, int(metrics.fault), {"learner": train_state.learner, "environments": train_state.env_states})
         warning = watch.divergence(self.config, metrics.learner)
@@ -249,7 +254,11 @@ class _Run:
         done, curriculum_config = state.done, self.config.curriculum
         phase = 1 if done <= curriculum_config.phase1.updates else 2
         learned = done <= curriculum_config.updates
-        learner = state.train.learner if learned else state.best.replace(averaged_policy=state.refine.policy)
+        learner = (
+            sharding.whole(state.train.learner, self.devices)
+            if learned
+            else state.best.replace(averaged_policy=state.refine.policy)
+        )
         cases = MonteCarloConfig(
             self.config.eval_cases,
             _EVAL_SEED,

@@ -116,6 +116,7 @@ def largest_value(config: TrainConfig, entropy_bonus: float = 0.0) -> float:
         + task.reward.zone_height * most("zone_weight")
         + task.reward.no_progress_cost
         + 3.0 * most("effort_weight")
+        + 2.0 * math.sqrt(3.0) * config.shielding.intervention_cost
     )
     per_step = config.sac.reward_scale * max(gain, loss) + abs(entropy_bonus)
     return float(per_step / (1.0 - most("discount")))

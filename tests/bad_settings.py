@@ -5,6 +5,7 @@ import dataclasses
 import io
 import os
 import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -96,8 +97,10 @@ def _outcome(line: _Line) -> str:
     if outcome == "refused" and not _is_named(line, errors.getvalue()):
         outcome = f"refused without a name: {errors.getvalue()[:300]}"
     left = set(os.listdir()) - before
-    if left:
+    if left and outcome != "accepted":  # such as --figures, whose folder is made when all else is checked
         outcome = f"left {sorted(left)} behind"
+    for name in left:
+        shutil.rmtree(name)
     return outcome if outcome in ("refused", "accepted") else f"{outcome} from {line.command} {line.argv[-12:]}"
 
 

@@ -2,6 +2,9 @@
 
 import dataclasses
 import json
+import socket
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -157,6 +160,57 @@ def test_the_command_keeps_blocks(tmp_path, capsys, monkeypatch):
     capsys.readouterr()
     assert tiny.status("eval_mc", *argv[:4], "--partial", tmp_path / "kept", "--replay-case", 3) == 2
     assert "partial: is not written with --replay-case" in capsys.readouterr().err
+
+
+def free_port() -> int:
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        return server.getsockname()[1]
+
+
+# Flies blocks of cases together with another process, and writes the results.
+JOIN = """
+import sys, pathlib
+from koz_jax import blocks, runtime
+runtime.join(sys.argv[1], 2, int(sys.argv[2]))
+import jax
+assert (jax.local_device_count(), jax.device_count()) == (2, 4)
+import test_blocks
+from koz_jax import storage
+folder = pathlib.Path(sys.argv[3])
+flown = blocks.run_cases(
+    test_blocks.AGENT, test_blocks.AGENT.task, test_blocks.CONFIG, partial=folder / "kept", block=test_blocks.BLOCK
+)
+storage.save_tree(folder / sys.argv[2], flown.results, {"compiled": flown.compile_s > 0})
+"""
+
+
+def test_two_processes_of_two_devices_give_the_results_of_one(single, tmp_path):
+    variables = {**tiny.environment(), "XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    address = f"127.0.0.1:{free_port()}"
+    workers = [
+        subprocess.Popen(
+            [sys.executable, "-c", JOIN, address, str(number), str(tmp_path)],
+            env=variables,
+            cwd=tiny.ROOT / "tests",
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for number in range(2)
+    ]
+    errors = [worker.communicate(timeout=300)[1] for worker in workers]
+    assert [worker.returncode for worker in workers] == [0, 0], errors
+    shapes = jax.eval_shape(lambda: single)
+    for number in range(2):
+        assert_same(jax.tree.map(np.asarray, storage.load_tree(tmp_path / str(number), shapes)), single)
+    names = {path.name for path in (tmp_path / "kept").iterdir()}
+    assert names == {"lock", *(f"block-{first:010d}" for first in (0, 1000, 2000))}
+
+
+def test_processes_that_do_not_exist_are_refused(capsys):
+    argv = ["--coordinator", "127.0.0.1:1", "--processes", 2, "--process", 2]
+    assert tiny.status("eval_mc", *argv) == 2
+    assert "process: must be from 0 to processes - 1 = 1, got 2" in capsys.readouterr().err
 
 
 # Flies cases on the devices that there are, and writes the results.

@@ -249,7 +249,7 @@ def test_arguments_reach_the_training(monkeypatch, capsys, empty_cwd):
     assert tiny.status("train", "--run", "my run") == 0
     (config, run, options), (_, named, _) = calls
     assert config == preset("paper").model_copy(update={"seed": 7})
-    assert options == {"resume": False, "start_from": Path("other")}
+    assert options == {"resume": False, "start_from": Path("other"), "devices": 1}
     assert re.fullmatch(r"runs/paper-seed7-\d{8}-\d{6}", str(run))
     assert named == Path("my run")
     assert capsys.readouterr().err.splitlines() == [
