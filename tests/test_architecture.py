@@ -84,7 +84,7 @@ def test_only_the_training_modules_see_both_learning_and_physics():
         for module, names in IMPORTS.items()
         if "koz_jax.env" in names and any(name.startswith("koz_jax.sac") for name in names)
     }
-    assert both <= {"koz_jax.training", "koz_jax.task", "koz_jax.refine"}
+    assert both <= {"koz_jax.training", "koz_jax.task", "koz_jax.refine", "koz_jax.agent"}
 
 
 @pytest.mark.parametrize(

@@ -112,7 +112,7 @@ def test_an_unwritable_place_is_refused(capsys, agent):
 @pytest.mark.parametrize("name", ["nobody", "", ".", "nowhere/run"])
 @pytest.mark.usefixtures("no_flight")
 def test_an_unknown_agent_is_refused_and_the_known_are_listed(capsys, monkeypatch, name):
-    monkeypatch.setattr("koz_jax.agent.shipped_agents", lambda: ("alpha", "beta"))
+    monkeypatch.setattr("koz_jax.agent_files.shipped_agents", lambda: ("alpha", "beta"))
     message = refused(capsys, "--agent", name)
     assert message.startswith(f"error: agent: {name!r} is neither a shipped agent (alpha, beta) nor a folder with")
 
@@ -129,11 +129,15 @@ def test_help_describes_every_flag(capsys):
     assert tiny.status("eval_mc", "--help") == 0
     # Wrapped lines and their frame do not count.
     text = re.sub(r"[\s│|]", "", capsys.readouterr().out)
-    (args,) = (
-        node for node in ast.parse((tiny.ROOT / "eval_mc.py").read_text()).body if isinstance(node, ast.ClassDef)
-    )
-    fields = [pair for pair in itertools.pairwise(args.body) if isinstance(pair[0], ast.AnnAssign)]
-    assert len(fields) >= 12
+    fields = [
+        pair
+        for path in ("eval_mc.py", "koz_jax/flight_args.py")
+        for node in ast.parse((tiny.ROOT / path).read_text()).body
+        if isinstance(node, ast.ClassDef)
+        for pair in itertools.pairwise(node.body)
+        if isinstance(pair[0], ast.AnnAssign)
+    ]
+    assert len(fields) >= 20
     for field, comment in fields:
         assert isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(comment, ast.Expr)
         assert f"--{field.target.id.replace('_', '-')}" in text

@@ -172,7 +172,7 @@ def test_exports_of_a_policy_that_sees_several_zones(tmp_path):
     np.testing.assert_allclose(library.decide(drawn.observation), drawn.action, rtol=0, atol=1e-6)
     subprocess.run(["make", "-s", "-C", tmp_path, "test"], check=True, capture_output=True)
     session = onnxruntime.InferenceSession(export(other, "onnx")["koz_policy.onnx"])
-    action = session.run(["action"], {"observation": drawn.observation})[0]
+    action = np.asarray(session.run(["action"], {"observation": drawn.observation})[0])
     np.testing.assert_allclose(action, drawn.action, rtol=0, atol=1e-6)
     reloaded = jax.export.deserialize(bytearray(export(other, "stablehlo")["koz_policy.jax_export"]))
     np.testing.assert_allclose(reloaded.call(drawn.observation), drawn.action, rtol=0, atol=1e-6)

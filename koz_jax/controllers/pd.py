@@ -21,10 +21,10 @@ class QuaternionFeedback(Memoryless):
     Without saturation the error decays with ``bandwidth`` and the rate follows with ``rate_bandwidth``.
     """
 
-    # Tuned for 60 s of the paper's reward without its zone term: ``tune pd --cases 500``, seed 1, from 1, 3 and 0.9.
-    bandwidth: Gain = 7.34  # () [1/s]
-    rate_bandwidth: Gain = 0.693  # () [1/s]
-    torque_share: Gain = 0.958  # () of the torque limit that braking counts on
+    # ``python -m koz_jax.controllers.tune pd`` at commit 00b415c.
+    bandwidth: Gain = 5.86  # () [1/s]
+    rate_bandwidth: Gain = 0.4071  # () [1/s]
+    torque_share: Gain = 1.066  # () of the torque limit that braking counts on
 
     def decide(self, state: EnvState, params: EnvParams, memory: None) -> tuple[jax.Array, None]:
         """Action (3,)."""

@@ -61,11 +61,11 @@ class PotentialFeedback(Memoryless):
     ratio.
     """
 
-    # ``python -m koz_jax.controllers.tune potential``, seed 1, at commit 9511a86.
-    frequency: Gain = 1.27  # () [rad/s]
-    damping: Gain = 4.46  # () ratio
-    barrier: Gain = 0.33  # ()
-    margin: Gain = 0.0523  # () [rad]
+    # ``python -m koz_jax.controllers.tune potential`` at commit 00b415c.
+    frequency: Gain = 1.149  # () [rad/s]
+    damping: Gain = 4.316  # () ratio
+    barrier: Gain = 0.3762  # ()
+    margin: Gain = 0.02756  # () [rad]
 
     def decide(self, state: EnvState, params: EnvParams, memory: None) -> tuple[jax.Array, None]:
         """Action (3,)."""

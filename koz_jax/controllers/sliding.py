@@ -20,15 +20,15 @@ from koz_jax.keep_out import KeepOutZone
 class PotentialSliding(Memoryless):
     """Reaches the surface with a limited switching term, and slides along it to the target."""
 
-    # Tuned for 60 s of the paper's reward: ``tune sliding --cases 500``, seed 1, from the gains of commit f6806dd.
-    bandwidth: Gain = 3.57  # () [1/s] with which the error decays near the target
-    reach: Gain = 0.839  # () [1/s], eta / eps: how fast s decays inside the boundary layer
-    layer: Gain = 0.0662  # () [rad/s], eps
-    torque_share: Gain = 0.707  # () of the torque limit that braking counts on
-    detour_share: Gain = 0.718  # () of the rate that is kept where the way leads aside
-    barrier: Gain = 0.0462  # () weight of a zone in the potential
-    margin: Gain = 0.0294  # () [rad] by which zones are taken wider
-    swirl: Gain = 2.03  # () part that leads around a zone, relative to the part that leads away from it
+    # ``python -m koz_jax.controllers.tune sliding`` at commit 00b415c.
+    bandwidth: Gain = 5.753  # () [1/s] with which the error decays near the target
+    reach: Gain = 0.4328  # () [1/s], eta / eps: how fast s decays inside the boundary layer
+    layer: Gain = 0.1371  # () [rad/s], eps
+    torque_share: Gain = 0.8932  # () of the torque limit that braking counts on
+    detour_share: Gain = 0.2404  # () of the rate that is kept where the way leads aside
+    barrier: Gain = 0.03003  # () weight of a zone in the potential
+    margin: Gain = 0.02237  # () [rad] by which zones are taken wider
+    swirl: Gain = 2.128  # () part that leads around a zone, relative to the part that leads away from it
 
     def decide(self, state: EnvState, params: EnvParams, memory: None) -> tuple[jax.Array, None]:
         """Action (3,)."""
