@@ -275,10 +275,10 @@ def _guide_torque(
     sideways = jnp.where(drift >= 0.0, shield.guide_rate, -shield.guide_rate)
     outward = jnp.clip(2.0 * shield.margin - margins[nearest], -shield.guide_rate, shield.guide_rate)
     wanted_B = rotations.cross(look_B, sideways * aside_B - outward * inward_B)
-    change_B = (wanted_B - body.omega_BN_B) / _GUIDE_SECONDS
+    change_B = (wanted_B - body.omega_BN_B) / GUIDE_SECONDS
     guide_B = dynamics.matvec(spacecraft.inertia_B, change_B) + gyroscopic_B
     return guide_B / jnp.maximum(1.0, jnp.max(jnp.abs(guide_B)) / spacecraft.torque_limit)
 
 
 # How fast the guide takes up its rate [s].
-_GUIDE_SECONDS = 0.5
+GUIDE_SECONDS = 0.5

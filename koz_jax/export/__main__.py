@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from koz_jax.errors import UserError, exit_status
+from koz_jax.shield_config import ShieldConfig
 
 if TYPE_CHECKING:
     from koz_jax.agent import Agent
@@ -29,6 +30,10 @@ class ExportArgs:
     """c: C99 with a self-test; onnx: a graph for onnxruntime; stablehlo: a program for XLA and jax.export."""
     out: Path
     """Folder to write into; older files of an export are replaced."""
+    shield: bool = False
+    """Also write the shield, which keeps the boresight out of every zone; for --to c."""
+    shield_margin_deg: float = ShieldConfig().margin_deg
+    """Angle that the shield keeps from every zone [deg]."""
 
 
 def main(argv: list[str]) -> int:
@@ -41,14 +46,22 @@ def _export(args: ExportArgs) -> int:
     from koz_jax import storage
     from koz_jax.agent import load_agent
 
+    if args.shield and args.to != "c":
+        raise UserError(f"shield: is exported as C only, got --to {args.to}")
+    config = ShieldConfig(margin_deg=args.shield_margin_deg)
+    if not args.shield and config != ShieldConfig():
+        raise UserError(f"shield_margin_deg: needs --shield, got {args.shield_margin_deg} without it")
     storage.make_folder("out", args.out)
-    for path in write_files(args.out, export(load_agent(args.agent), args.to)):
+    files = export(load_agent(args.agent), args.to, config if args.shield else None)
+    for path in write_files(args.out, files):
         print(path)
     return 0
 
 
-def export(agent: Agent, to: Literal["c", "onnx", "stablehlo"]) -> dict[str, bytes]:
+def export(agent: Agent, to: Literal["c", "onnx", "stablehlo"], shield: ShieldConfig | None = None) -> dict[str, bytes]:
     """Contents of the exported files by their names.
+
+    shield: of C only; None leaves it out.
 
     Raises:
         UserError: a package that the format needs is not installed.
@@ -62,10 +75,11 @@ def export(agent: Agent, to: Literal["c", "onnx", "stablehlo"]) -> dict[str, byt
         from koz_jax.export.stablehlo import stablehlo_files
 
         return stablehlo_files(agent)
-    from koz_jax.export.c import c_files
+    from koz_jax.export.c import c_files, shield_files
     from koz_jax.export.golden import golden
 
-    return c_files(agent.to_numpy(), golden(agent, GOLDEN_VECTORS))
+    files = c_files(agent.to_numpy(), golden(agent, GOLDEN_VECTORS))
+    return files if shield is None else files | shield_files(agent.to_numpy(), shield)
 
 
 def write_files(folder: Path, files: Mapping[str, bytes]) -> list[Path]:

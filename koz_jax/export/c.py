@@ -1,19 +1,22 @@
-"""C99 source of a controller: no allocation, fixed loops, constants, nothing beyond libm."""
+"""C99 source of a controller, and of its shield: no allocation, fixed loops, constants, nothing beyond libm."""
 
 import importlib.resources
 from collections.abc import Iterable
 
 import numpy as np
 
+from koz_jax import dynamics, shield, task
 from koz_jax.export.golden import Golden
 from koz_jax.export.metadata import Metadata, as_text, describe
 from koz_jax.layout import size
 from koz_jax.numpy_policy import ACTION_SIZE, NumpyPolicy, told_zones
+from koz_jax.shield_config import ShieldConfig
 
 # 1e-5 of the action's range, which is 2.
 _ACTION_TOLERANCE = "2e-5"
 _OBSERVATION_TOLERANCE = "2e-5"
 _TEMPLATES = ("koz_math.h", "koz_policy.h", "koz_policy.c", "koz_selftest.c", "Makefile")
+_SHIELD_TEMPLATES = ("koz_shield.h", "koz_shield.c")
 
 
 def c_files(policy: NumpyPolicy, vectors: Golden) -> dict[str, bytes]:
@@ -43,6 +46,35 @@ def c_files(policy: NumpyPolicy, vectors: Golden) -> dict[str, bytes]:
         "ACTIONS": _rows(vectors.action),
     }
     return {name: _fill(name, replacements).encode() for name in _TEMPLATES}
+
+
+def shield_files(policy: NumpyPolicy, config: ShieldConfig) -> dict[str, bytes]:
+    """Header and source of a shield for the spacecraft of a policy, by file name."""
+    metadata = describe(policy)
+    params = task.env_params(metadata.task)
+    made = shield.for_spacecraft(config, params.spacecraft, params.dt)
+    matrices = {
+        "INERTIA": params.spacecraft.inertia_B,
+        "INVERSE_INERTIA": dynamics.inverse(params.spacecraft.inertia_B),
+    }
+    numbers = {
+        "MARGIN": made.margin,
+        "BRAKE_TORQUE": made.brake_torque,
+        "ARC_ERROR": made.arc_error,
+        "RATE_ERROR": made.rate_error,
+        "GUIDE_RATE": made.guide_rate,
+        "SMALLEST_MOMENT": made.smallest_moment,
+        "LARGEST_MOMENT": made.largest_moment,
+        "GUIDE_SECONDS": shield.GUIDE_SECONDS,
+    }
+    replacements = {
+        "HEAD": _head(metadata),
+        "MARGIN_DEG": f"{np.rad2deg(made.margin):.4g}",
+        "SAMPLES": str(made.samples),
+        **{name: ", ".join(_braced(row) for row in np.asarray(matrix)) for name, matrix in matrices.items()},
+        **{name: _number(float(value)) for name, value in numbers.items()},
+    }
+    return {name: _fill(name, replacements).encode() for name in _SHIELD_TEMPLATES}
 
 
 def _head(metadata: Metadata) -> str:

@@ -26,12 +26,13 @@ class CLibrary:
             UserError: there is no exported source, or it cannot be compiled.
 
         """
-        source = Path(folder) / "koz_policy.c"
+        source, shield = Path(folder) / "koz_policy.c", Path(folder) / "koz_shield.c"
         if not source.is_file():
             raise UserError(f"folder: {folder} holds no koz_policy.c; python -m koz_jax.export AGENT --to c makes one")
         with tempfile.TemporaryDirectory() as built:
             library = Path(built) / "koz_policy.so"
-            command = [compiler, *STRICT, "-O2", "-shared", "-fPIC", "-o", str(library), str(source), "-lm"]
+            sources = [str(path) for path in (source, shield) if path.is_file()]
+            command = [compiler, *STRICT, "-O2", "-shared", "-fPIC", "-o", str(library), *sources, "-lm"]
             try:
                 done = subprocess.run(command, capture_output=True, text=True, check=False)
             except OSError as error:
@@ -46,6 +47,10 @@ class CLibrary:
         for name in ("koz_observe", "koz_decide", "koz_torque"):
             getattr(self._functions, name).argtypes = (ctypes.c_void_p, ctypes.c_void_p)
             getattr(self._functions, name).restype = None
+        self.has_shield = shield.is_file()
+        if self.has_shield:
+            self._functions.koz_shield.argtypes = (ctypes.c_void_p,) * 3
+            self._functions.koz_shield.restype = None
 
     def observe(self, situations: np.ndarray) -> np.ndarray:
         """Observations (batch, entries) of situations (batch, 12 + 4 zones): ``koz_situation`` field by field."""
@@ -58,6 +63,22 @@ class CLibrary:
     def torque(self, observations: np.ndarray) -> np.ndarray:
         """Torques (batch, 3) [N m] in body axes for observations (batch, entries)."""
         return self._rows("koz_torque", observations, self._observation_size, ACTION_SIZE)
+
+    def shield(self, situations: np.ndarray, torques: np.ndarray) -> np.ndarray:
+        """Torques (batch, 3) [N m] that the shield allows in place of the requested ones.
+
+        Raises:
+            UserError: it was exported without a shield.
+
+        """
+        if not self.has_shield:
+            raise UserError("shield: this controller was exported without; --shield exports it")
+        told = np.ascontiguousarray(situations, np.float32)
+        requested = np.ascontiguousarray(torques, np.float32)
+        allowed = np.empty_like(requested)
+        for row, torque, into in zip(told, requested, allowed, strict=True):
+            self._functions.koz_shield(row.ctypes.data, torque.ctypes.data, into.ctypes.data)
+        return allowed
 
     def _rows(self, name: str, inputs: np.ndarray, entries: int, size: int) -> np.ndarray:
         function = getattr(self._functions, name)

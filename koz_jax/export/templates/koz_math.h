@@ -1,5 +1,5 @@
 /*
- * Vectors and scalar-first quaternions, for koz_policy.c.
+ * Vectors and scalar-first quaternions, for koz_policy.c and koz_shield.c.
  *
 @HEAD@
  */

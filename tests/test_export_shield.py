@@ -1,0 +1,137 @@
+"""The exported shield decides as the core's does, and holds where it is the one that flies."""
+
+import shutil
+
+import jax
+import numpy as np
+import pytest
+import tiny
+from flax import struct
+
+from koz_jax import evaluation, rollout, shield, task
+from koz_jax.agent import load_agent
+from koz_jax.controllers.base import Controller
+from koz_jax.controllers.registry import load_controller
+from koz_jax.env import EnvParams, EnvState
+from koz_jax.errors import UserError
+from koz_jax.export.__main__ import export, main, write_files
+from koz_jax.export.golden import Golden, Situation, golden, situations
+from koz_jax.export.library import CLibrary
+from koz_jax.rollout import CaseResult
+from koz_jax.shield_config import ShieldConfig
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+
+CONFIG = ShieldConfig(margin_deg=0.2)
+COUNT = 4000
+
+
+@pytest.fixture(scope="module")
+def agent():
+    return load_agent("phase1")
+
+
+@pytest.fixture(scope="module")
+def library(agent, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("shield")
+    write_files(folder, export(agent, "c", CONFIG))
+    return CLibrary(folder)
+
+
+@pytest.fixture(scope="module")
+def vectors(agent) -> Golden:
+    return golden(agent, COUNT, seed=4)
+
+
+def requests() -> np.ndarray:
+    """Torques anywhere in the box."""
+    return np.random.default_rng(0).uniform(-2.0, 2.0, (COUNT, 3)).astype(np.float32)
+
+
+def test_it_decides_as_the_core_does(agent, library, vectors):
+    params = task.env_params(agent.task)
+    made = shield.for_spacecraft(CONFIG, params.spacecraft, params.dt)
+
+    @jax.jit
+    @jax.vmap
+    def expect(drawn: Situation, torque_B: jax.Array) -> jax.Array:
+        return made.filter(drawn.state().body, torque_B, drawn.state().scenario.zones, params)
+
+    expected = np.asarray(expect(situations(agent, COUNT, seed=4), requests()))
+    found = library.shield(vectors.situation, requests())
+    passed = np.all(expected == requests(), axis=1)
+    assert np.sum(passed) > 100 and np.sum(~passed) > 100, "some requests pass and some do not"
+    # The same candidate, but for situations within rounding of a threshold.
+    same = np.all(np.abs(found - expected) < 1e-3, axis=1)
+    assert np.mean(same) > 0.998 and np.mean(same[~passed]) > 0.95
+    assert np.array_equal(found[passed & same], requests()[passed & same])
+    assert np.all(np.abs(found) <= 2.0)
+
+
+class Guarded(struct.PyTreeNode):
+    """Another controller with the C shield in its way."""
+
+    inner: Controller
+    library: CLibrary = struct.field(pytree_node=False)
+
+    def begin(self, state: EnvState, params: EnvParams, key: jax.Array):
+        return self.inner.begin(state, params, key)
+
+    def decide(self, state: EnvState, params: EnvParams, memory):
+        action, memory = self.inner.decide(state, params, memory)
+        zones, body = state.scenario.zones, state.body
+        told = (body.q_BN, body.omega_BN_B, state.scenario.q_DN, zones.axis_N.ravel(), zones.half_angle)
+        row = jax.numpy.concatenate([*told, state.q_e0_previous[None]])
+        shape = jax.ShapeDtypeStruct((3,), np.float32)
+        limit = params.spacecraft.torque_limit
+        allowed = jax.pure_callback(self._ask, shape, row, limit * action, vmap_method="broadcast_all")
+        return allowed / limit, memory
+
+    def _ask(self, rows: np.ndarray, torques: np.ndarray) -> np.ndarray:
+        allowed = self.library.shield(np.atleast_2d(rows), np.atleast_2d(torques))
+        return allowed.reshape(np.shape(torques))
+
+
+def test_it_holds_against_one_who_steers_into_the_zone(agent, library):
+    params = task.env_params(agent.task)
+    adversary = load_controller("adversary").controller
+    config = evaluation.MonteCarloConfig(cases=24, seed=1)
+
+    @jax.jit
+    @jax.vmap
+    def fly(case: jax.Array) -> tuple[CaseResult, ...]:
+        drawn = evaluation.draw_case(agent.task, config, case)
+        key = jax.random.key(1)
+        return tuple(
+            rollout.run_case(who, drawn, params, 300, substeps=4, key=key)
+            for who in (adversary, Guarded(adversary, library))
+        )
+
+    bare, guarded = fly(np.arange(config.cases))
+    assert np.all(np.asarray(bare.violated))
+    assert not np.any(np.asarray(guarded.violated))
+
+
+def test_what_is_not_a_number_never_passes(library, vectors):
+    nothing = np.full((COUNT, 3), np.nan, np.float32)
+    found = library.shield(vectors.situation, nothing)
+    assert np.all(np.isfinite(found)) and np.all(np.abs(found) <= 2.0)
+
+
+def test_the_command_line_asks_for_it(tmp_path, capsys):
+    tiny.untrained_agent().save(tmp_path / "agent")
+    where = [str(tmp_path / "agent"), "--out", str(tmp_path / "c")]
+    assert main([*where, "--to", "c", "--shield", "--shield-margin-deg", "0.5"]) == 0
+    assert "Keeps 0.5 deg from every zone" in (tmp_path / "c" / "koz_shield.h").read_text()
+    assert CLibrary(tmp_path / "c").has_shield
+    capsys.readouterr()
+    for flags, reason in (
+        (["--to", "onnx", "--shield"], "error: shield: is exported as C only"),
+        (["--to", "c", "--shield-margin-deg", "0.5"], "error: shield_margin_deg: needs --shield"),
+        (["--to", "c", "--shield", "--shield-margin-deg", "0"], "error: margin_deg: Input should be greater than 0"),
+    ):
+        assert main([*where, *flags]) == 2
+        assert reason in capsys.readouterr().err
+    (tmp_path / "c" / "koz_shield.c").unlink()
+    with pytest.raises(UserError, match="exported without"):
+        CLibrary(tmp_path / "c").shield(np.zeros((1, 16)), np.zeros((1, 3)))
