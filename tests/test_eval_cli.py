@@ -88,6 +88,15 @@ BAD = [
     ("--json .", ["json: . must be a new or an ordinary file"]),
     ("--csv /dev/null", ["csv: /dev/null must be a new or an ordinary file"]),
     ("--colour red", ["--colour"]),
+    ("--robust", ["robust: is of the shield, and needs --shield"]),
+    ("--shield-margin-deg 1", ["shield_margin_deg: needs --shield, got 1.0"]),
+    ("--shield --robust", ["robust: needs an error to withstand"]),
+    ("--shield --shield-margin-deg 0", ["margin_deg", "greater than 0"]),
+    ("--shield --robust --disturbance-torque 3", ["disturbance_torque: must be below the torque limit of 2.0", "3.0"]),
+    ("--inertia-error 1.5", ["inertia_error", "less than 1", "1.5"]),
+    ("--controller nobody", ["controller: must be one of pd, potential", "nobody"]),
+    ("--zones 9", ["zones", "less than or equal to 8", "9"]),
+    ("--max-rate-deg -1", ["max_rate_deg", "greater than or equal to 0", "-1"]),
 ]
 
 

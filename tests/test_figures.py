@@ -422,7 +422,7 @@ REFUSED = {
 @pytest.mark.parametrize("name", REFUSED)
 def test_fly_refuses_before_it_flies(name, agent, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(evaluation, "_fly_and_judge", lambda *_, **__: pytest.fail("something was flown"))
+    monkeypatch.setattr(evaluation, "_keep_and_judge", lambda *_, **__: pytest.fail("something was flown"))
     Path("file").touch()
     argv, message = REFUSED[name]
     assert tiny.status("fly", "--agent", agent, *argv) == 2
