@@ -119,13 +119,13 @@ def table(summary: Summary, cases: int, name: str, shielded: bool = False) -> st
         rate("not settled", "non_settled_rate"),
         rate("violated", "violation_rate"),
         rate("success", "success_rate", 0),
-        ("smallest margin [deg]", "", f"{ours.min_margin_deg:.3f}"),
+        ("smallest margin [deg]", "-", f"{ours.min_margin_deg:.3f}"),
     ]
     if shielded:
         rows += [
-            ("shield intervened, of all steps", "", f"{100 * ours.intervention_rate:.2f} %"),
-            ("mean change of torque [N m]", "", f"{ours.mean_torque_change:.4f}"),
-            ("deadlocked", "", f"{100 * ours.deadlock_rate:.2f} %"),
+            ("shield intervened, of all steps", "-", f"{100 * ours.intervention_rate:.2f} %"),
+            ("mean change of torque [N m]", "-", f"{ours.mean_torque_change:.4f}"),
+            ("deadlocked", "-", f"{100 * ours.deadlock_rate:.2f} %"),
         ]
     widths = [max(len(row[column]) for row in rows) for column in range(3)]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]

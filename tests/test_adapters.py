@@ -234,7 +234,7 @@ def imports_of(path):
 def test_only_the_adapters_need_optional_packages():
     optional = {"gymnasium", "stable_baselines3", "sbx", "torch"}
     users = {module for module, path in MODULES.items() if imports_of(path) & optional}
-    assert users == {"koz_jax.gym_env", "koz_jax.sb3_env"}
+    assert users == {"koz_jax.gym_env", "koz_jax.sb3_env", "koz_jax.sb3_policy"}
 
 
 @pytest.mark.parametrize(

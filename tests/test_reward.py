@@ -149,14 +149,16 @@ def test_tightening_moves_the_edge_of_the_penalty_outwards(full):
 
 
 def test_only_being_on_target_is_rewarded(full):
-    found = _terms_of(full, angle=0.0, angle_previous=0.0, torque=1.0, torque_change=1.0, zone_margin=0.0)
+    found = _terms_of(
+        full, angle=0.0, angle_previous=0.0, torque=1.0, torque_change=1.0, zone_margin=0.0, intervention=1.0
+    )
     assert {name for name, value in found.items() if value > 0} == {"attitude", "settled"}
     assert {name for name, value in found.items() if value < 0} == set(NAMES) - {"attitude", "settled"}
 
 
-def test_paper_reward_leaves_out_effort_and_nothing_else(full):
-    found = _terms(_outcome(torque=1.0, torque_change=1.0, zone_margin=0.01), full, TORQUE_LIMIT)
-    expected = sum(float(getattr(found, name)) for name in NAMES if name != "effort")
+def test_paper_reward_leaves_out_effort_and_intervention_and_nothing_else(full):
+    found = _terms(_outcome(torque=1.0, torque_change=1.0, zone_margin=0.01, intervention=1.0), full, TORQUE_LIMIT)
+    expected = sum(float(getattr(found, name)) for name in NAMES if name not in ("effort", "intervention"))
     assert float(reward.total(found, PAPER_WEIGHTS)) == pytest.approx(expected, rel=1e-6)
 
 
