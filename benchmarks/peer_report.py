@@ -90,15 +90,17 @@ def _bound(report: Report) -> str:
     updates, seconds = (ours.updates_to(0.95), ours.seconds_to(0.95)) if ours else (None, None)
     if updates is None or seconds is None:
         return ""
-    rows = [["", "95 % not before (extrapolated)", "times ours"]]
+    rows = [["", "95 % not within (measured)", "times ours", "95 % not before (extrapolated)", "times ours"]]
     for result in report.results:
         speed = result.updates_per_second
         if speed and result.name not in ("koz_jax", "brax PPO") and result.seconds_to(0.95) is None:
-            least = updates / speed
-            rows.append([result.name, f"{least:.0f} s", f"{least / seconds:.1f}"])
+            trained, least = 60.0 * result.minutes, updates / speed
+            bounds = [text for bound in (trained, least) for text in (f"{bound:.0f} s", f"{bound / seconds:.1f}")]
+            rows.append([result.name, *bounds])
     return (
         f"Ours showed 95 % after {updates:,} updates and {seconds:.0f} s. Where a peer did not get there, its time is"
-        " not known. What follows is no measurement: the time that its updates/s would take for as many updates as ours"
+        " not known, only that it is longer than the training. The last two columns are no measurement: the time"
+        " that its updates/s would take for as many updates as ours"
         " needed, as if it learned as much from each without the curriculum, the encoding and the n-step returns."
         f"\n\n{_table(rows)}"
     )
