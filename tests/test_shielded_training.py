@@ -72,8 +72,8 @@ def test_an_intervention_costs_what_the_settings_say(guarded):
     assert base - two == pytest.approx(2.0 * (base - one), rel=1e-2)
 
 
-def test_training_runs_on_the_longer_observation(guarded):
-    assert guarded.buffer.rows.observation.shape[-1] == observation.size(3)
-    state, metrics = training.train_chunk(_config(enabled=True), guarded, jnp.int32(2))
+def test_training_runs_on_the_longer_observation(free):
+    assert free.buffer.rows.observation.shape[-1] == observation.size(3)
+    state, metrics = training.train_chunk(_config(), jax.tree.map(jnp.copy, free), jnp.int32(2))
     assert int(state.updates) == 4
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(metrics))
