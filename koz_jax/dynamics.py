@@ -36,6 +36,11 @@ def inverse(inertia_B: jax.Array) -> jax.Array:
     return adjugate / rotations.dot(c1, adjugate[0])
 
 
+def gyroscopic_torque(omega_BN_B: jax.Array, inertia_B: jax.Array) -> jax.Array:
+    """w x (I w), the torque that keeps a rate.  omega_BN_B: (3,) [rad/s]; inertia_B: (3, 3).  Returns (3,) [N m]."""
+    return rotations.cross(omega_BN_B, matvec(inertia_B, omega_BN_B))
+
+
 def angular_acceleration(
     omega_BN_B: jax.Array, torque_B: jax.Array, inertia_B: jax.Array, inverse_inertia_B: jax.Array
 ) -> jax.Array:
@@ -43,7 +48,7 @@ def angular_acceleration(
 
     omega_BN_B: (3,) [rad/s]; torque_B: (3,) [N m]; inertia_B and its inverse: (3, 3).  Returns (3,) [rad/s^2].
     """
-    return matvec(inverse_inertia_B, torque_B - rotations.cross(omega_BN_B, matvec(inertia_B, omega_BN_B)))
+    return matvec(inverse_inertia_B, torque_B - gyroscopic_torque(omega_BN_B, inertia_B))
 
 
 def attitude_rate(q_BN: jax.Array, omega_BN_B: jax.Array) -> jax.Array:

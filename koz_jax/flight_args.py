@@ -19,7 +19,8 @@ class FlightArgs:
     """Fly random cases."""
 
     agent: str = "phase2"
-    """A shipped agent by name (phase1, phase2), the folder of a run or of an agent, or a Stable-Baselines3 SAC zip."""
+    """A shipped agent by name (phase1, phase2, phase2-sac, zones3), the folder of a run or of an agent, or a
+    Stable-Baselines3 SAC zip."""
     controller: str | None = None
     """Fly this on the agent's task in place of the agent: pd, potential, sliding, planner; or one that does its worst:
     random, bang_bang, adversary, spin_up."""

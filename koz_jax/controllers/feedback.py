@@ -34,11 +34,6 @@ def error_vector(state: EnvState) -> jax.Array:
     return rotation_vector(env.attitude_error(state))
 
 
-def gyroscopic_torque(omega_BN_B: jax.Array, spacecraft: Spacecraft) -> jax.Array:
-    """w x (I w), which has to be applied to keep the rate.  omega_BN_B: (3,) [rad/s].  Returns (3,) [N m]."""
-    return rotations.cross(omega_BN_B, dynamics.matvec(spacecraft.inertia_B, omega_BN_B))
-
-
 def brake_rate(distance: jax.Array, deceleration: jax.Array, bandwidth: Gain) -> jax.Array:
     """Rate from which one comes to rest in a distance: linear near the end, a square root farther out.
 
@@ -55,7 +50,7 @@ def deceleration_about(axis_B: jax.Array, rate: jax.Array, spacecraft: Spacecraf
 
     axis_B: (3,) unit or zero; rate: () [rad/s]; share: () of the torque limit that is used.  Returns () [rad/s^2].
     """
-    gyroscopic_B = gyroscopic_torque(rate * axis_B, spacecraft)
+    gyroscopic_B = dynamics.gyroscopic_torque(rate * axis_B, spacecraft.inertia_B)
     per_acceleration = -dynamics.matvec(spacecraft.inertia_B, axis_B)
     limit = share * spacecraft.torque_limit
     room = limit - jnp.sign(per_acceleration) * gyroscopic_B
@@ -69,7 +64,7 @@ def action(acceleration_B: jax.Array, body: RigidBodyState, params: EnvParams) -
     The acceleration keeps its direction, so that a turn about an axis stays one.
     """
     spacecraft = params.spacecraft
-    gyroscopic_B = gyroscopic_torque(body.omega_BN_B, spacecraft)
+    gyroscopic_B = dynamics.gyroscopic_torque(body.omega_BN_B, spacecraft.inertia_B)
     wanted_B = dynamics.matvec(spacecraft.inertia_B, acceleration_B)
     room = spacecraft.torque_limit - jnp.sign(wanted_B) * gyroscopic_B
     share = jnp.min(room / jnp.maximum(jnp.abs(wanted_B), 1e-9))

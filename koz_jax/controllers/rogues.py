@@ -61,7 +61,7 @@ class Adversary(Memoryless):
 
 
 class SpinUp(Memoryless):
-    """Builds up rate for some seconds away from the zone's direction, then steers into the zone."""
+    """Builds up rate for some seconds about an axis of the body, then steers into the zone."""
 
     spin_seconds: jax.Array = struct.field(default_factory=lambda: jnp.float32(20.0))  # () [s]
     axis_B: jax.Array = struct.field(default_factory=lambda: jnp.array([1.0, 1.0, 1.0]))  # (3,) spun up about
