@@ -11,6 +11,7 @@ import tyro
 
 from koz_jax.errors import UserError, exit_status
 from koz_jax.flight_args import FlightArgs
+from koz_jax.process_args import ProcessArgs
 
 if TYPE_CHECKING:
     from koz_jax.controllers.base import Pilot
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True)
-class EvalArgs(FlightArgs):
+class EvalArgs(ProcessArgs, FlightArgs):
     """Fly a trained agent, or another controller, over many random cases; print the paper's table beside its own."""
 
     substeps: int = 1
@@ -29,13 +30,8 @@ class EvalArgs(FlightArgs):
     csv: Path | None = None
     """Write a row per case."""
     partial: Path | None = None
-    """Keep finished blocks of cases in this folder; the same command goes on from them when it was interrupted."""
-    coordinator: str | None = None
-    """Fly with other processes that share --partial: the address (host:port) of the first of them."""
-    processes: int = 1
-    """How many processes there are."""
-    process: int = 0
-    """The number of this one; number 0 writes the results."""
+    """Keep finished blocks of cases in this folder; the same command goes on from them when it was interrupted.
+    Several processes need one, in which each puts its share of the blocks."""
     figures: Path | None = None
     """Draw the Monte Carlo figures into this folder, as PNG and PDF (needs the extra viz)."""
     replay_case: int | None = None
@@ -55,8 +51,7 @@ def _evaluate(args: EvalArgs) -> int:
 
     config = args.config(args.substeps)
     runtime.configure()
-    if args.coordinator is not None:
-        runtime.join(args.coordinator, args.processes, args.process)
+    args.join()
     pilot = args.pilot()
     task = args.task(pilot)
     evaluation.check_feasible(task, config.max_angle_deg)

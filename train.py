@@ -12,10 +12,11 @@ from koz_jax import flags
 from koz_jax.config import TrainConfig
 from koz_jax.errors import UserError, exit_status
 from koz_jax.presets import preset
+from koz_jax.process_args import ProcessArgs
 
 
 @dataclasses.dataclass(frozen=True)
-class RunArgs:
+class RunArgs(ProcessArgs):
     """Train a controller that turns a spacecraft without looking into a keep-out zone."""
 
     run: Path | None = None
@@ -27,7 +28,7 @@ class RunArgs:
     cases: int = 10_000
     """Monte Carlo cases of the table at the end."""
     devices: int = 1
-    """Divide the environments and the replay buffer among so many devices (not with --seeds)."""
+    """Divide the environments and the replay buffer among so many devices of each process (not with --seeds)."""
     seeds: int = 1
     """Train so many seeds, from --seed on, each on a core of its own; the best by evaluation is the run's agent."""
 
@@ -38,7 +39,8 @@ def parse(argv: list[str]) -> tuple[TrainConfig, RunArgs]:
     first.add_argument("--preset", nargs="?", const="")
     first.add_argument("--resume", nargs="?", const="")
     first.add_argument("--cases", nargs="?")
-    first.add_argument("--devices", nargs="?")
+    for name in ("devices", "coordinator", "processes", "process"):
+        first.add_argument(f"--{name}", nargs="?")
     chosen, others = first.parse_known_args(argv)
     if chosen.preset is not None:
         others += ["--preset", chosen.preset]
@@ -51,6 +53,11 @@ def parse(argv: list[str]) -> tuple[TrainConfig, RunArgs]:
         raise UserError(f"seeds: must be from 1 to 1000, got {args.seeds}")
     if args.devices < 1 or (args.devices > 1 and args.seeds > 1):
         raise UserError(f"devices: must be 1 or more, and 1 with --seeds, got {args.devices}")
+    if args.coordinator is not None:
+        if args.seeds > 1:
+            raise UserError(f"coordinator: is for one agent, not for --seeds {args.seeds}; got {args.coordinator}")
+        if args.run is None and args.resume is None:
+            raise UserError("run: must be given where several processes write to one folder")
     return config, args
 
 
@@ -70,9 +77,12 @@ def _train(config: TrainConfig, args: RunArgs) -> int:
     if args.seeds > 1 or (args.resume is not None and os.path.isfile(run / "seeds.json")):
         return _train_seeds(config, args, run)
     runtime.configure()
+    args.join()
     if args.resume:
         config = RunFolder(run).read_config()
     agent = train(config, run, resume=args.resume is not None, start_from=args.start_from, devices=args.devices)
+    if args.process > 0:
+        return 0
     if agent is None:
         return _stopped(run)
     flown = evaluation.monte_carlo(agent, args.cases)

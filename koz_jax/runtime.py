@@ -9,17 +9,26 @@ from koz_jax.errors import UserError
 
 
 def configure() -> None:
-    """Use every CPU core as a device for evaluation, and keep compiled programs from one run to the next.
+    """Use every CPU core as a device for evaluation, and keep compiled programs.
 
     Call before anything touches a device.
     """
     jax.config.update(
         "jax_num_cpu_devices", len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     )
+    keep_programs()
+
+
+def keep_programs() -> None:
+    """Keep compiled programs from one run to the next, also for the processes that this one starts."""
     if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
         root = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-        jax.config.update("jax_compilation_cache_dir", str(root / "koz_jax" / "compiled"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+        for name, value in {
+            "jax_compilation_cache_dir": str(root / "koz_jax" / "compiled"),
+            "jax_persistent_cache_min_compile_time_secs": 0.3,
+        }.items():
+            jax.config.update(name, value)
+            os.environ[name.upper()] = str(value)
 
 
 def join(coordinator: str, processes: int, process: int) -> None:

@@ -14,21 +14,22 @@ import jax.numpy as jnp
 import numpy as np
 
 import koz_jax
-from koz_jax import curriculum, evaluation, memory, refine, reward, sharding, storage, training, watch
+from koz_jax import curriculum, evaluation, memory, processes, refine, reward, sharding, storage, training, watch
 from koz_jax.agent import Agent, PolicyController, Provenance
 from koz_jax.config import TrainConfig
 from koz_jax.errors import UserError
 from koz_jax.evaluation import MonteCarloConfig
 from koz_jax.interrupt import StopRequest
 from koz_jax.lock import FolderLock
-from koz_jax.metrics_log import MetricsLog, flatten
+from koz_jax.metrics_log import flatten
 from koz_jax.progress import Progress
 from koz_jax.rollout import CaseResult
 from koz_jax.run_folder import Checkpoint, RunFolder, RunState, load_checkpoint, load_source, record_of
+from koz_jax.run_writer import RunWriter
 from koz_jax.sac import replay
+from koz_jax.sac.learner import LearnerState
 from koz_jax.summary import Summary, summarise
 from koz_jax.training import TrainState
-from koz_jax.writer import Writer
 
 # Evaluation scenarios during training: the same for every run, and drawn from a seed that people do not type.
 _EVAL_SEED = 2_718_281_828
@@ -51,7 +52,9 @@ def train(
         resume: go on exactly where the run stopped.
         start_from: a snapshot (or the checkpoint of another run) whose learner and replay buffer to begin with.
         progress: show a progress bar on stderr.
-        devices: divide the environments and the replay buffer among so many devices.
+        devices: divide the environments and the replay buffer among so many devices of this process.  Several
+            processes (see ``runtime.join``) divide them among the devices of all; all get the same arguments and need
+            a folder that all of them see, and the first one writes.
 
     Returns:
         The best agent of the last phase, or None if the run was interrupted (its checkpoint is then up to date).
@@ -64,8 +67,10 @@ def train(
         raise UserError(f"start_from: a resumed run goes on from its own checkpoint, got {start_from}")
     folder = RunFolder(Path(run))
     sharding.check(config, devices)
-    with StopRequest() as stop, _resumed(folder, config) if resume else _begun(folder, config, start_from) as saved:
-        with Progress(config, saved.state.done, enabled=progress) as bar:
+    opening = _resumed(folder, config) if resume else _begun(folder, config, start_from)
+    with StopRequest() as stop, contextlib.ExitStack() as stack:
+        saved = processes.together(lambda: stack.enter_context(opening))
+        with Progress(config, saved.state.done, enabled=progress and processes.leads()) as bar:
             bar.note(f"run folder: {folder.path}")
             with _memory_errors():
                 return _Run(config, folder, bar, stop, devices).go(saved)
@@ -76,7 +81,7 @@ def _resumed(folder: RunFolder, config: TrainConfig) -> Iterator[Checkpoint]:
     """A run to go on with, locked."""
     if not folder.config.is_file():
         raise UserError(f"resume: {folder.path} is not a run folder (it has no {folder.config.name})")
-    with FolderLock(folder.path):
+    with FolderLock(folder.path) if processes.leads() else contextlib.nullcontext():
         template = _template(config)
         memory.check(config, template.train.buffer, template)
         yield load_checkpoint(folder, config, template)
@@ -86,14 +91,15 @@ def _resumed(folder: RunFolder, config: TrainConfig) -> Iterator[Checkpoint]:
 def _begun(folder: RunFolder, config: TrainConfig, start_from: Path | str | None) -> Iterator[Checkpoint]:
     """A new run, locked, with its first checkpoint; on an error before that nothing is left of it."""
     evaluation.check_feasible(config.task, config.eval_max_angle_deg, "eval_max_angle_deg")
-    with folder.begin():
+    with folder.begin() if processes.leads() else contextlib.nullcontext():
         template = _template(config)
         memory.check(config, template.train.buffer, template)
         source = None if start_from is None else load_source(Path(start_from), config, template)
         with _memory_errors():
             state = _begin(config, source)
-        storage.save_tree(folder.checkpoint(0), state, record_of(state, config))
-        folder.write_config(config)
+        if processes.leads():
+            storage.save_tree(folder.checkpoint(0), state, record_of(state, config))
+            folder.write_config(config)
         yield Checkpoint(state, "")
 
 
@@ -156,7 +162,6 @@ class _Run:
         self.folder = folder
         self.bar = bar
         self.stop = stop
-        self.writer = Writer()
         self.warned = False  # that the critic diverges
         phase1, learned = config.curriculum.phase1.updates, config.curriculum.updates
         self.evaluations = sorted(
@@ -172,47 +177,37 @@ class _Run:
         """Train to the end, or until asked to stop."""
         state = saved.state
         if state.done < self.config.length:
-            self.folder.prune(state.done)
-            with self.writer:
-                state = self._train(state, saved.log)
+            with RunWriter(self.folder, self.config, saved) as out:
+                state = self._train(state, out)
         if state.done < self.config.length:
             return None
         return self._agent(state, 2 if self.config.curriculum.phase2.updates else 1)
 
-    def _train(self, state: RunState, logged: str) -> RunState:
+    def _train(self, state: RunState, out: RunWriter) -> RunState:
         """Go on chunk by chunk; log, evaluate and checkpoint on the way."""
-        log = MetricsLog(self.folder.path, logged, state.done)
         self.bar.compiling()
         # The first row of a log names its columns.
         blank = dict.fromkeys(("refine/cost", *_EVAL_NAMES), math.nan)
         saved_at = state.done
-        try:
-            while state.done < self.config.length and not self.stop.requested:
-                learning = state.done < self.config.curriculum.updates
-                before, start = state.done, time.perf_counter()
-                state, measured = self._learn(state) if learning else self._refine(state)
-                speed = {"updates_per_second": (state.done - before) / (time.perf_counter() - start)}
-                values = measured | blank | measured  # what is measured stands first, and is not blanked
-                blank = {}
-                self.writer.check()
-                self.bar.advance(state.done)
-                if state.done in self.evaluations:
-                    state, evaluated = self._evaluate(state)
-                    log.write(state.done, values | evaluated, speed)
-                    self._checkpoint(state, log)
-                    saved_at = state.done
-                else:
-                    log.write(state.done, values, speed)
-            if saved_at < state.done:
-                self._checkpoint(state, log)
-        finally:
-            log.close()
+        while state.done < self.config.length and not processes.any_of(self.stop.requested):
+            learning = state.done < self.config.curriculum.updates
+            before, start = state.done, time.perf_counter()
+            state, measured = self._learn(state) if learning else self._refine(state)
+            speed = {"updates_per_second": (state.done - before) / (time.perf_counter() - start)}
+            values = measured | blank | measured  # what is measured stands first, and is not blanked
+            blank = {}
+            self.bar.advance(state.done)
+            if state.done in self.evaluations:
+                state, evaluated = self._evaluate(state, out)
+                out.row(state.done, values | evaluated, speed)
+                out.checkpoint(sharding.gather(state))
+                saved_at = state.done
+            else:
+                out.row(state.done, values, speed)
+            processes.raise_together(out.error)
+        if saved_at < state.done:
+            out.checkpoint(sharding.gather(state))
         return state
-
-    def _checkpoint(self, state: RunState, log: MetricsLog) -> None:
-        """Begin to write a checkpoint; those before the last two go when it is whole."""
-        record = record_of(state, self.config, log.text)
-        self.writer.save(self.folder.checkpoint(state.done), state, record, self.folder.prune)
 
     def _chunk_end(self, done: int, log_every: int) -> int:
         """Where the next chunk ends: at the next line of the log or the next evaluation."""
@@ -225,7 +220,7 @@ class _Run:
         end = self._chunk_end(done, self.config.log_every)
         steps = (end - done) // self.config.updates_per_step
         placed = sharding.place(state.train, self.devices)
-        train_state, metrics = training.train_chunk(self.config, placed, jnp.int32(steps))
+        train_state, metrics = training.train_chunk(self.config, placed, np.int32(steps))
         metrics = jax.device_get(metrics)
         watch.check(end, int(metrics.fault), {"learner": train_state.learner, "environments": train_state.env_states})
         warning = watch.divergence(self.config, metrics.learner)
@@ -249,7 +244,7 @@ class _Run:
         watch.check(end, watch.SOUND, {"refine/cost": cost, "refine/state": refined})
         return state.replace(refine=refined), {"refine/cost": float(cost)}
 
-    def _evaluate(self, state: RunState) -> tuple[RunState, dict[str, float]]:
+    def _evaluate(self, state: RunState, out: RunWriter) -> tuple[RunState, dict[str, float]]:
         """Judge the policy, keep the best, and at the end of a stage hand it on."""
         done, curriculum_config = state.done, self.config.curriculum
         phase = 1 if done <= curriculum_config.phase1.updates else 2
@@ -259,6 +254,26 @@ class _Run:
             if learned
             else state.best.replace(averaged_policy=state.refine.policy)
         )
+        judged = self._judge(learner, phase) if processes.leads() else {"eval/score": math.nan}
+        found = processes.from_first(judged["eval/score"])
+        watch.check(done, watch.SOUND, {"eval/score": jnp.float32(found)})
+        if found > float(state.best_score):
+            best = jax.tree.map(jnp.copy, learner)
+            state = state.replace(best=best, best_score=jnp.float32(found), best_at=jnp.int32(done))
+            out.agent(self.folder.agent(phase), self._agent(state, phase))
+        if done == curriculum_config.phase1.updates:
+            out.snapshot("phase1", sharding.gather(state))
+            if curriculum_config.phase2.updates:
+                learner = jax.tree.map(jnp.copy, state.best)
+                state = _fresh(self.config, state.train.replace(learner=learner))
+        elif done == curriculum_config.updates and self.config.refine.iterations:
+            out.agent(self.folder.sac_agent, self._agent(state, phase))
+            policy = jax.tree.map(jnp.copy, state.best.averaged_policy)
+            state = state.replace(refine=refine.init(self.config, policy))
+        return state, judged
+
+    def _judge(self, learner: LearnerState, phase: int) -> dict[str, float]:
+        """Fly the policy; score and summary by the names of their columns."""
         cases = MonteCarloConfig(
             self.config.eval_cases,
             _EVAL_SEED,
@@ -268,23 +283,10 @@ class _Run:
         )
         controller = PolicyController(learner.averaged_policy, self.config.network)
         results = evaluation.fly_cases(controller, self.config.task, cases)
-        found, summary = score(results, self.config, phase), summarise(results)
-        watch.check(done, watch.SOUND, {"eval/score": jnp.float32(found)})
+        summary = summarise(results)
         self.bar.evaluated(summary)
-        if found > float(state.best_score):
-            best = jax.tree.map(jnp.copy, learner)
-            state = state.replace(best=best, best_score=jnp.float32(found), best_at=jnp.int32(done))
-            self._agent(state, phase).save(self.folder.agent(phase))
-        if done == curriculum_config.phase1.updates:
-            self.writer.save(self.folder.snapshot("phase1"), state, record_of(state, self.config))
-            if curriculum_config.phase2.updates:
-                learner = jax.tree.map(jnp.copy, state.best)
-                state = _fresh(self.config, state.train.replace(learner=learner))
-        elif done == curriculum_config.updates and self.config.refine.iterations:
-            self._agent(state, phase).save(self.folder.sac_agent)
-            policy = jax.tree.map(jnp.copy, state.best.averaged_policy)
-            state = state.replace(refine=refine.init(self.config, policy))
-        return state, {"eval/score": found, **{f"eval/{name}": value for name, value in vars(summary).items()}}
+        values = {f"eval/{name}": value for name, value in vars(summary).items()}
+        return {"eval/score": score(results, self.config, phase), **values}
 
     def _agent(self, state: RunState, phase: int) -> Agent:
         """The best agent of the phase so far."""

@@ -19,7 +19,7 @@ from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
 from nbformat import NotebookNode, validate, writes
 
-from koz_jax import storage
+from koz_jax import runtime, storage
 from koz_jax.errors import UserError, exit_status
 
 HERE = Path(__file__).resolve().parent
@@ -42,6 +42,7 @@ def _build(chosen: list[str], names: list[str], out: Path) -> int:
     for name in chosen:
         if name not in names:
             raise UserError(f"notebooks: unknown notebook {name!r}; allowed: {', '.join(names)}")
+    runtime.keep_programs()
     begin = time.perf_counter()
     for name in chosen:
         start = time.perf_counter()

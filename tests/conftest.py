@@ -6,9 +6,12 @@ import jax
 import pytest
 from hypothesis import settings
 
-from koz_jax import task
+from koz_jax import runtime, task
 from koz_jax.env import EnvParams
 from koz_jax.task_config import TaskConfig
+
+# For the other workers, for subprocesses, and for the next session.
+runtime.keep_programs()
 
 # The first example of a property compiles; a deadline would measure that.
 settings.register_profile("koz_jax", deadline=None, derandomize=True, max_examples=50)

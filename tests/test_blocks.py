@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -162,12 +161,6 @@ def test_the_command_keeps_blocks(tmp_path, capsys, monkeypatch):
     assert "partial: is not written with --replay-case" in capsys.readouterr().err
 
 
-def free_port() -> int:
-    with socket.socket() as server:
-        server.bind(("127.0.0.1", 0))
-        return server.getsockname()[1]
-
-
 # Flies blocks of cases together with another process, and writes the results.
 JOIN = """
 import sys, pathlib
@@ -187,7 +180,7 @@ storage.save_tree(folder / sys.argv[2], flown.results, {"compiled": flown.compil
 
 def test_two_processes_of_two_devices_give_the_results_of_one(single, tmp_path):
     variables = {**tiny.environment(), "XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
-    address = f"127.0.0.1:{free_port()}"
+    address = f"127.0.0.1:{tiny.free_port()}"
     workers = [
         subprocess.Popen(
             [sys.executable, "-c", JOIN, address, str(number), str(tmp_path)],

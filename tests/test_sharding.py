@@ -1,5 +1,9 @@
-"""Training on several devices: the same as on one up to rounding; impossible numbers of devices are refused."""
+"""Training on several devices, in one process or in several: the same as on one up to rounding."""
 
+import itertools
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import jax
@@ -61,13 +65,66 @@ def test_steps_on_four_devices_equal_those_on_one(four):
         np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-5, err_msg=jax.tree_util.keystr(path))
 
 
-def test_a_run_on_four_devices_is_like_that_on_one(four):
-    one, other = (read_metrics(folder / "metrics.csv") for folder in (four / "run", tiny.finished_run().path))
-    assert [row["updates"] for row in one] == [row["updates"] for row in other]
-    assert float(one[0]["train/critic_loss"]) == pytest.approx(float(other[0]["train/critic_loss"]), rel=1e-3)
+def assert_like_the_run_on_one_device(folder: RunFolder) -> None:
+    one, other = (read_metrics(path / "metrics.csv") for path in (folder.path, tiny.finished_run().path))
+    assert [row["updates"] for row in one] == [row["updates"] for row in other[: len(one)]]
+    # Rounding grows from update to update, so that only the first ones can be compared.
+    for early, name in itertools.product((0, 1), ("critic_loss", "actor_loss", "entropy", "q_mean")):
+        found, expected = (float(rows[early][f"train/{name}"]) for rows in (one, other))
+        assert found == pytest.approx(expected, rel=2e-3)
     # Its checkpoint is one like any other.
-    state = storage.load_tree(RunFolder(four / "run").checkpoints()[0], trainer._template(CONFIG))
-    assert state.done == CONFIG.length
+    config = folder.read_config()
+    state = storage.load_tree(folder.checkpoints()[0], trainer._template(config))
+    assert state.done == config.length == int(one[-1]["updates"])
+
+
+def test_a_run_on_four_devices_is_like_that_on_one(four):
+    assert_like_the_run_on_one_device(RunFolder(four / "run"))
+
+
+def commands(run: Path, *argv: object) -> list[subprocess.Popen[str]]:
+    """Two processes of ``train.py`` with two devices each, begun."""
+    address = f"127.0.0.1:{tiny.free_port()}"
+    several = ["--devices", 2, "--cases", 1, "--coordinator", address, "--processes", 2, "--process"]
+    variables = tiny.environment() | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    return [
+        subprocess.Popen(
+            [sys.executable, "train.py", *map(str, [*argv, *several, number])],
+            env=variables,
+            cwd=tiny.ROOT,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for number in range(2)
+    ]
+
+
+def test_two_processes_of_two_devices_stopped_and_resumed_train_as_one_device(tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    workers = commands(folder.path, *tiny.FLAGS, "--refine.iterations", 0, "--run", folder.path)
+    while not (folder.path / "metrics.csv").exists() and all(worker.poll() is None for worker in workers):
+        time.sleep(0.01)
+    workers[1].terminate()  # one is told, both stop
+    errors = [worker.communicate(timeout=300)[1] for worker in workers]
+    assert [worker.returncode for worker in workers] == [0, 0], errors
+    stopped = read_metrics(folder.path / "metrics.csv")
+    assert 0 < len(stopped) < len(read_metrics(tiny.finished_run().path / "metrics.csv"))
+
+    workers = commands(folder.path, "--resume", folder.path)
+    errors = [worker.communicate(timeout=300)[1] for worker in workers]
+    assert [worker.returncode for worker in workers] == [0, 0], errors
+    assert_like_the_run_on_one_device(folder)
+
+
+def test_a_run_that_one_process_refuses_ends_in_all(tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    (folder.path / "thesis").mkdir(parents=True)
+    workers = commands(folder.path, *tiny.FLAGS, "--run", folder.path)
+    errors = [worker.communicate(timeout=300)[1] for worker in workers]
+    assert [worker.returncode for worker in workers] == [2, 2], errors
+    assert f"run: {folder.path} exists already" in errors[0]
+    assert "processes: another process has failed" in errors[1]
+    assert [path.name for path in folder.path.iterdir()] == ["thesis"]
 
 
 def test_impossible_numbers_of_devices_are_refused(tmp_path, capsys, monkeypatch):

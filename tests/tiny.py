@@ -1,13 +1,12 @@
 """A training run of seconds, and the two command lines as modules; shared by the tests of the user's side."""
 
-import contextlib
 import functools
 import importlib.util
 import os
+import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -16,7 +15,6 @@ from unittest import mock
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.compilation_cache import compilation_cache
 
 from koz_jax import observation
 from koz_jax.agent import Agent, PolicyController, Provenance, policy_network
@@ -88,28 +86,8 @@ _FOLDER = tempfile.TemporaryDirectory(prefix="koz_jax-tests-")
 def finished_run() -> RunFolder:
     """The undisturbed run of ``CONFIG``, trained once per session.  Read it, do not change it."""
     folder = RunFolder(Path(_FOLDER.name) / "undisturbed")
-    with kept_programs():
-        assert train(CONFIG, folder.path, progress=False) is not None
+    assert train(CONFIG, folder.path, progress=False) is not None
     return folder
-
-
-# Programs that this session compiled, for its subprocesses.
-CACHE = Path(_FOLDER.name) / "compiled"
-
-
-@contextlib.contextmanager
-def kept_programs() -> Iterator[None]:
-    """Keep what is compiled in ``CACHE``."""
-    values = {"jax_compilation_cache_dir": str(CACHE), "jax_persistent_cache_min_compile_time_secs": 0.0}
-    before = {name: getattr(jax.config, name) for name in values}
-    for name, value in values.items():
-        jax.config.update(name, value)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            jax.config.update(name, value)
-        compilation_cache.reset_cache()
 
 
 @functools.cache
@@ -134,20 +112,21 @@ def status(name: str, *argv: object) -> int:
 
 
 def run_python(*argv: object, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
-    """Run Python in a subprocess, which shares the compiled programs of this session."""
+    """Run Python in a subprocess."""
     command = [sys.executable, *map(str, argv)]
     return subprocess.run(command, env=environment(), cwd=cwd, capture_output=True, text=True, check=False)
 
 
 def environment() -> dict[str, str]:
-    """Variables of a subprocess that shares the compiled programs of this session."""
-    return {
-        **os.environ,
-        "JAX_COMPILATION_CACHE_DIR": str(CACHE),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        "JAX_PLATFORMS": "cpu",
-        "PYTHONPATH": str(ROOT),
-    }
+    """Variables of a subprocess."""
+    return {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+
+
+def free_port() -> int:
+    """A port of this machine that nobody listens on."""
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        return server.getsockname()[1]
 
 
 def contents(folder: Path) -> dict[Path, bytes | None]:

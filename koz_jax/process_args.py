@@ -1,0 +1,35 @@
+"""Flags of commands that several processes can work on together.  Imports no jax."""
+
+import dataclasses
+
+from koz_jax.errors import UserError
+
+
+@dataclasses.dataclass(frozen=True)
+class ProcessArgs:
+    """Which of several processes this is."""
+
+    coordinator: str | None = None
+    """Work together with other processes, on this machine or on others that see the same files: the address
+    (host:port) of the first of them.  All get the same command, but for --process."""
+    processes: int = 1
+    """How many processes there are."""
+    process: int = 0
+    """The number of this one; number 0 writes the results."""
+
+    def join(self) -> None:
+        """Find the other processes, if there are any.  Call before anything touches a device.
+
+        Raises:
+            UserError: there is no such process, or the others are not found.
+
+        """
+        if self.coordinator is None:
+            for name in ("processes", "process"):
+                value = getattr(self, name)
+                if value != getattr(ProcessArgs, name):
+                    raise UserError(f"{name}: needs --coordinator, got {value} without it")
+        else:
+            from koz_jax import runtime
+
+            runtime.join(self.coordinator, self.processes, self.process)
