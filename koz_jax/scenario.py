@@ -147,13 +147,12 @@ def _add_zones(key: jax.Array, ranges: ScenarioRanges, looks_D: jax.Array, first
 
     looks_D: (2, 3) boresight at target and start; first: leaves (1, ...).  Returns leaves (max_zones, ...).
     """
-    key_number, *keys = jax.random.split(key, ranges.max_zones)
-    number = jax.random.randint(key_number, (), ranges.min_zones, ranges.max_zones + 1)
-    zones = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), first, keep_out.no_zones(ranges.max_zones - 1))
+    keys = jax.random.split(key, ranges.max_zones)
+    number = jax.random.randint(keys[0], (), ranges.min_zones, ranges.max_zones + 1)
     to_all = jax.vmap(rotations.angle_between, in_axes=(None, 0))
 
-    for i, key_zone in enumerate(keys, start=1):
-        key_axis, key_size = jax.random.split(key_zone)
+    def add(i: jax.Array, zones: KeepOutZone) -> KeepOutZone:
+        key_axis, key_size = jax.random.split(keys[i])
         size = jax.random.uniform(key_size)
         half_angle = ranges.min_half_angle + (ranges.max_half_angle - ranges.min_half_angle) * size
         axes = jax.vmap(rotations.normalize)(jax.random.normal(key_axis, (_PLACES, 3)))
@@ -165,11 +164,14 @@ def _add_zones(key: jax.Array, ranges: ScenarioRanges, looks_D: jax.Array, first
         fits = jnp.all(clear, axis=1) & jnp.all(apart, axis=1)
         place = jnp.argmax(fits)
         wanted = (i < number) & fits[place]
-        zones = KeepOutZone(
+        return KeepOutZone(
             axis_N=zones.axis_N.at[i].set(jnp.where(wanted, axes[place], zones.axis_N[i])),
             half_angle=zones.half_angle.at[i].set(jnp.where(wanted, half_angle, keep_out.NO_ZONE_HALF_ANGLE)),
         )
-    return zones
+
+    empty = keep_out.no_zones(ranges.max_zones - 1)
+    zones = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), first, empty)
+    return jax.lax.fori_loop(1, ranges.max_zones, add, zones)
 
 
 def paper_test() -> Scenario:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import base64
+import concurrent.futures
 import os
 import sys
 import tempfile
@@ -34,21 +35,30 @@ def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="notebooks/build.py", description=__doc__)
     parser.add_argument("notebooks", nargs="*", metavar="NAME", help=f"by default all: {', '.join(names)}")
     parser.add_argument("--out", type=Path, default=HERE, help="folder of the .ipynb files; by default this one")
+    parser.add_argument("--jobs", type=int, default=1, help="how many to execute at a time; by default one")
     args = parser.parse_args(argv)
-    return exit_status(lambda: _build(args.notebooks or names, names, args.out))
+    return exit_status(lambda: _build(args.notebooks or names, names, args.out, args.jobs))
 
 
-def _build(chosen: list[str], names: list[str], out: Path) -> int:
+def _build(chosen: list[str], names: list[str], out: Path, jobs: int) -> int:
     for name in chosen:
         if name not in names:
             raise UserError(f"notebooks: unknown notebook {name!r}; allowed: {', '.join(names)}")
+    if jobs < 1:
+        raise UserError(f"jobs: must be 1 or more, got {jobs}")
     runtime.keep_programs()
-    begin = time.perf_counter()
-    for name in chosen:
+    # The kernel of this environment, whatever others the user has.
+    os.environ["JUPYTER_PREFER_ENV_PATH"] = "1"
+
+    def build(name: str) -> None:
         start = time.perf_counter()
         notebook = execute(HERE / f"{name}.py")
         storage.write_text(out / f"{name}.ipynb", writes(notebook) + "\n")
         print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
+
+    begin = time.perf_counter()
+    with concurrent.futures.ThreadPoolExecutor(jobs) as pool:
+        list(pool.map(build, chosen))
     print(f"{len(chosen)} notebooks in {time.perf_counter() - begin:.0f} s")
     return 0
 
@@ -62,8 +72,6 @@ def execute(source: Path) -> NotebookNode:
     """
     notebook = jupytext.read(source)
     notebook.metadata = NotebookNode(kernelspec=_KERNEL, language_info={"name": "python"})
-    # The kernel of this environment, whatever others the user has.
-    os.environ["JUPYTER_PREFER_ENV_PATH"] = "1"
     with tempfile.TemporaryDirectory(prefix="koz_jax-notebook-") as folder:
         client = NotebookClient(
             notebook,

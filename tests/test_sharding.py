@@ -24,7 +24,7 @@ STEPS = 4
 TRAIN = """
 import sys, pathlib
 import jax, jax.numpy as jnp
-from tiny import CONFIG
+from tiny import CONFIG, UNREFINED
 from koz_jax import sharding, storage, training
 from koz_jax.trainer import train
 assert jax.local_device_count() == 4
@@ -37,7 +37,7 @@ for _ in range(2):
         assert len({shard.device for shard in shards}) == 4
         assert sum(shard.data.size for shard in shards) == leaf.size  # divided, not copied
 storage.save_tree(folder / "state", (state, metrics), {})
-assert train(CONFIG, folder / "run", progress=False, devices=4) is not None
+assert train(UNREFINED, folder / "run", progress=False, devices=4) is not None
 """
 
 

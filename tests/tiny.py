@@ -56,6 +56,7 @@ def merged(settings: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 
 CONFIG = TrainConfig.model_validate(merged(preset("paper").model_dump(), SETTINGS))
+UNREFINED = TrainConfig.model_validate(merged(CONFIG.model_dump(), {"refine": {"iterations": 0}}))
 
 
 def flags(settings: dict[str, Any], prefix: str = "--") -> list[str]:
