@@ -50,6 +50,7 @@ def _evaluate(args: EvalArgs) -> int:
     from koz_jax import evaluation, runtime
 
     config = args.config(args.substeps)
+    args.check()
     runtime.configure()
     args.join()
     pilot = args.pilot()

@@ -53,6 +53,7 @@ def parse(argv: list[str]) -> tuple[TrainConfig, RunArgs]:
         raise UserError(f"seeds: must be from 1 to 1000, got {args.seeds}")
     if args.devices < 1 or (args.devices > 1 and args.seeds > 1):
         raise UserError(f"devices: must be 1 or more, and 1 with --seeds, got {args.devices}")
+    args.check()
     if args.coordinator is not None:
         if args.seeds > 1:
             raise UserError(f"coordinator: is for one agent, not for --seeds {args.seeds}; got {args.coordinator}")

@@ -28,6 +28,9 @@ from tiny import CONFIG, FLAGS  # noqa: E402
 
 from koz_jax.run_folder import RunFolder  # noqa: E402
 
+# An accepted command line may ask for more work than anybody waits for; it is then asked to stop.
+_RUN_S = 90.0
+
 
 def train_command(*argv: object) -> list[str]:
     return [sys.executable, str(ROOT / "train.py"), *map(str, argv), "--cases", "12"]
@@ -145,6 +148,33 @@ def remount(disk: Path, options: str) -> None:
     subprocess.run(["mount", "-o", f"remount,{options}", disk], check=True)
 
 
+def bad_lines(count: int, cache: Path, work: Path) -> tuple[str, bool]:
+    """Refuse or accept generated command lines, then run those that were accepted, at most ``_RUN_S`` each."""
+    tried = bad_settings.refusals(count, work)
+    ends: list[str] = []
+    wrong: list[str] = []
+    for number, line in enumerate(tried.accepted):
+        folder = work / f"accepted-{number}"
+        folder.mkdir()
+        command = [sys.executable, str(ROOT / f"{line.command}.py"), *line.argv]
+        with subprocess.Popen(
+            command, cwd=folder, env=environment(cache), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        ) as process:
+            try:
+                errors = process.communicate(timeout=_RUN_S)[1]
+                ends.append("refused by name after all" if process.returncode == 2 else "finished")
+            except subprocess.TimeoutExpired:
+                process.terminate()
+                errors = process.communicate()[1]
+                ends.append("stopped")
+        expected = (0, 2, -signal.SIGTERM) if line.command == "eval_mc" else (0, 2)
+        if process.returncode not in expected or "Traceback" in errors:
+            wrong.append(f"{process.returncode} from {command[1:]}: {errors[-300:]}")
+    counts = ", ".join(f"{ends.count(end)} {end}" for end in sorted(set(ends)))
+    text = f"{tried.text}; of the accepted {counts}, {len(wrong)} wrong"
+    return "\n  ".join([text, *wrong]), tried.sound and not wrong
+
+
 def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--kills", type=int, default=20)
@@ -164,7 +194,7 @@ def main(argv: list[str]) -> int:
             "full and read-only disk": lambda: full_disk(reference, cache, work),
             "corruptions": lambda: corruption.corruptions(args.corruptions, reference, CONFIG, work),
             "no numbers": lambda: faults.faults(CONFIG, work),
-            "bad settings": lambda: bad_settings.refusals(args.bad, work),
+            "bad settings": lambda: bad_lines(args.bad, cache, work),
         }
         for name, job in jobs.items():
             start = time.perf_counter()

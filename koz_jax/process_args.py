@@ -1,6 +1,7 @@
 """Flags of commands that several processes can work on together.  Imports no jax."""
 
 import dataclasses
+import re
 
 from koz_jax.errors import UserError
 
@@ -17,11 +18,11 @@ class ProcessArgs:
     process: int = 0
     """The number of this one; number 0 writes the results."""
 
-    def join(self) -> None:
-        """Find the other processes, if there are any.  Call before anything touches a device.
+    def check(self) -> None:
+        """Refuse processes that cannot be.
 
         Raises:
-            UserError: there is no such process, or the others are not found.
+            UserError: there is no such process, or no way to find it.
 
         """
         if self.coordinator is None:
@@ -29,7 +30,21 @@ class ProcessArgs:
                 value = getattr(self, name)
                 if value != getattr(ProcessArgs, name):
                     raise UserError(f"{name}: needs --coordinator, got {value} without it")
-        else:
+        elif not re.fullmatch(r"[^\s:]+:[0-9]{1,5}", self.coordinator):
+            raise UserError(f"coordinator: must be host:port, got {self.coordinator!r}")
+        if self.processes < 1:
+            raise UserError(f"processes: must be 1 or more, got {self.processes}")
+        if not 0 <= self.process < self.processes:
+            raise UserError(f"process: must be from 0 to processes - 1 = {self.processes - 1}, got {self.process}")
+
+    def join(self) -> None:
+        """Find the other processes, if there are any.  Call before anything touches a device.
+
+        Raises:
+            UserError: they are not found.
+
+        """
+        if self.coordinator is not None:
             from koz_jax import runtime
 
             runtime.join(self.coordinator, self.processes, self.process)

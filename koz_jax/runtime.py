@@ -42,11 +42,9 @@ def join(coordinator: str, processes: int, process: int) -> None:
         process: the number of this one.
 
     Raises:
-        UserError: there is no such process, or the others are not found.
+        UserError: the others are not found.
 
     """
-    if not 0 <= process < processes:
-        raise UserError(f"process: must be from 0 to processes - 1 = {processes - 1}, got {process}")
     try:
         jax.distributed.initialize(coordinator, processes, process)
     except (RuntimeError, ValueError) as error:

@@ -15,7 +15,7 @@ import tiny
 from hypothesis import Phase, given, seed, settings
 from hypothesis import strategies as st
 
-from koz_jax import blocks, evaluation, trainer
+from koz_jax import blocks, evaluation, seeds, trainer
 from koz_jax.presets import preset
 from koz_jax.settings import Settings
 
@@ -31,10 +31,13 @@ def _names(part: Settings, prefix: str = "--") -> Iterator[str]:
         yield from _names(value, f"{flag}.") if isinstance(value, Settings) else [flag]
 
 
-TRAIN_FLAGS = [*_names(preset("fast")), "--cases", "--start-from", "--resume"]
-EVAL_FLAGS = [
-    f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(tiny.script("eval_mc").EvalArgs) if field.init
-]
+def _flags(command: str, args: str) -> list[str]:
+    fields = dataclasses.fields(getattr(tiny.script(command), args))
+    return [f"--{field.name.replace('_', '-')}" for field in fields]
+
+
+TRAIN_FLAGS = [*_names(preset("fast")), *_flags("train", "RunArgs")]
+EVAL_FLAGS = _flags("eval_mc", "EvalArgs")
 
 WORDS = [
     *("nan", "inf", "-inf", "-1", "0", "0.0", "-0.0", "1", "2", "1.5", "90", "180", "360", "1e-30", "1e30", "1e400"),
@@ -49,7 +52,7 @@ LINES = st.tuples(st.integers(0, 4), st.lists(CHANGE, min_size=1, max_size=3), N
 
 
 @dataclasses.dataclass(frozen=True)
-class _Line:
+class Line:
     """A generated command line."""
 
     command: str
@@ -58,12 +61,12 @@ class _Line:
     surplus: list[str]  # words that may be too many: some flags take none
 
 
-def _line(drawn: Any) -> _Line:
+def _line(drawn: Any) -> Line:
     kind, changes, noise = drawn
     command, flags = ("eval_mc", EVAL_FLAGS) if kind == 0 else ("train", TRAIN_FLAGS)
     chosen = [(flags[index % len(flags)], values) for index, values in changes]
     argv = [] if kind == 0 else [*tiny.FLAGS, "--run", "run"]
-    return _Line(
+    return Line(
         command,
         argv + [word for flag, values in chosen for word in (flag, *values)] + noise,
         [flag for flag, _ in chosen],
@@ -75,14 +78,14 @@ def _plain(text: str) -> str:
     return re.sub(r"[\s│]", "", text).replace("-", "_").lower()
 
 
-def _is_named(line: _Line, message: str) -> bool:
+def _is_named(line: Line, message: str) -> bool:
     """Whether a refusal names a flag that was changed, or a word that was too many."""
     message = _plain(message)
     named = any(_plain(flag).strip("_").split(".")[-1] in message for flag in line.flags)
     return named or ("unrecognizedoptions" in message and any(_plain(word) in message for word in line.surplus))
 
 
-def _outcome(line: _Line) -> str:
+def _outcome(line: Line) -> str:
     """What a command line comes to: "refused", "accepted", or what was wrong about how it was refused."""
     errors = io.StringIO()
     before = set(os.listdir())
@@ -104,15 +107,28 @@ def _outcome(line: _Line) -> str:
     return outcome if outcome in ("refused", "accepted") else f"{outcome} from {line.command} {line.argv[-12:]}"
 
 
-def refusals(count: int, work: Path) -> tuple[str, bool]:
-    """Try command lines in an empty folder.  Returns a line of text, and whether each was refused well or accepted."""
+@dataclasses.dataclass(frozen=True)
+class Tried:
+    """What became of the command lines."""
+
+    text: str
+    sound: bool  # each was refused well, or accepted
+    accepted: list[Line]
+
+
+def refusals(count: int, work: Path) -> Tried:
+    """Try command lines in an empty folder; the work of those that are accepted is not begun."""
     outcomes: list[str] = []
+    accepted: list[Line] = []
 
     @seed(6)
     @settings(max_examples=count, database=None, deadline=None, phases=[Phase.generate], derandomize=False)
     @given(LINES)
     def attempt(drawn: Any) -> None:
-        outcomes.append(_outcome(_line(drawn)))
+        line = _line(drawn)
+        outcomes.append(_outcome(line))
+        if outcomes[-1] == "accepted":
+            accepted.append(line)
 
     def accept(*_: Any, **__: Any) -> None:
         raise AcceptedError
@@ -122,10 +138,10 @@ def refusals(count: int, work: Path) -> tuple[str, bool]:
     with contextlib.ExitStack() as stack:
         stack.enter_context(contextlib.chdir(empty))
         stack.enter_context(mock.patch.dict(os.environ, {"COLUMNS": "300"}))
-        for module, name in [(trainer, "_begin"), (blocks, "run_cases"), (evaluation, "fly_case")]:
+        begins = [(trainer, "_begin"), (seeds, "train_all"), (blocks, "run_cases"), (evaluation, "fly_case")]
+        for module, name in begins:
             stack.enter_context(mock.patch.object(module, name, accept))
         attempt()
     wrong = [outcome for outcome in outcomes if outcome not in ("refused", "accepted")]
-    refused, accepted = outcomes.count("refused"), outcomes.count("accepted")
-    text = f"{len(outcomes)}: {refused} refused by name, {accepted} accepted; {len(wrong)} wrong"
-    return "\n  ".join([text, *wrong[:5]]), not wrong
+    text = f"{len(outcomes)}: {outcomes.count('refused')} refused by name, {len(accepted)} accepted; {len(wrong)} wrong"
+    return Tried("\n  ".join([text, *wrong[:5]]), not wrong, accepted)

@@ -16,5 +16,5 @@ def test_random_damage_is_named_or_survived(tmp_path):
 
 
 def test_generated_command_lines_are_refused_by_name_or_accepted(tmp_path):
-    text, sound = bad_settings.refusals(25, tmp_path)
-    assert sound, text
+    tried = bad_settings.refusals(25, tmp_path)
+    assert tried.sound, tried.text
