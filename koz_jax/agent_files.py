@@ -21,6 +21,8 @@ class Provenance(Settings):
     """Commit of the repository it was trained with."""
     version: str = ""
     """Version of koz_jax."""
+    config_sha256: str = ""
+    """Hash of the whole ``config.json`` of the run; empty where there was none."""
     seed: int = 0
     """Seed of the training."""
     phase: int = 0

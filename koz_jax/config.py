@@ -6,6 +6,7 @@ Angles are in degrees here, where people write them, and in radians everywhere e
 
 from __future__ import annotations
 
+import hashlib
 from typing import Self
 
 from pydantic import model_validator
@@ -284,6 +285,15 @@ class TrainConfig(Settings):
                 f" {self.eval_min_angle_deg} and {self.eval_max_angle_deg}"
             )
         return self
+
+    def to_json(self) -> str:
+        """What ``config.json`` of a run holds."""
+        return self.model_dump_json(indent=2) + "\n"
+
+    @property
+    def sha256(self) -> str:
+        """Hash of all settings: that of the file ``config.json``."""
+        return hashlib.sha256(self.to_json().encode()).hexdigest()
 
     @property
     def length(self) -> int:

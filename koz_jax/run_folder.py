@@ -141,7 +141,7 @@ class RunFolder:
 
     def write_config(self, config: TrainConfig) -> None:
         """Write the configuration of a run that has begun."""
-        storage.write_text(self.config, config.model_dump_json(indent=2) + "\n")
+        storage.write_text(self.config, config.to_json())
 
     def read_config(self) -> TrainConfig:
         """Read the configuration of an existing run."""

@@ -295,6 +295,7 @@ class _Run:
             command=shlex.join(["python", *sys.argv]),
             commit=self.commit,
             version=koz_jax.__version__,
+            config_sha256=self.config.sha256,
             seed=self.config.seed,
             phase=phase,
             updates=min(best_at, learned),

@@ -218,6 +218,7 @@ def test_every_export_carries_its_metadata(agent, session, c_folder):
             assert f"{name}: {meaning(name)}" in flat
         assert metadata.training_sha256 in flat and metadata.weights_sha256 in flat
         assert "torque 2 N m" in flat and agent.provenance.command in flat
+        assert f"config.json: {agent.provenance.config_sha256}" in flat and len(agent.provenance.config_sha256) == 64
     for described in (session.get_modelmeta().custom_metadata_map["koz_jax"], files["koz_policy.json"]):
         assert type(metadata).model_validate_json(described) == metadata
     ends = [entry.start + entry.size for entry in metadata.observation]

@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import hashlib
 import json
 import math
 import os
@@ -129,6 +130,8 @@ def test_layout_of_a_run(run):
     }
     assert any((run.path / "tensorboard").iterdir())
     assert run.read_config() == CONFIG
+    in_file = hashlib.sha256(run.config.read_bytes()).hexdigest()
+    assert load_agent(run.path).provenance.config_sha256 == in_file
 
 
 def test_metrics_have_a_row_per_chunk_and_an_evaluation_where_due(run):

@@ -93,7 +93,8 @@ def as_text(metadata: Metadata) -> str:
         f" ({task.scenario.max_rate_deg:g} deg/s).",
         "",
         f"Trained by: {origin.command or 'unknown'} (commit {origin.commit or 'unknown'}, seed {origin.seed}).",
-        f"Hash of the training's settings: {metadata.training_sha256}",
+        f"Hash of the training run's config.json: {origin.config_sha256 or 'unknown'}",
+        f"Hash of network, task and origin: {metadata.training_sha256}",
         f"Hash of the weights: {metadata.weights_sha256}",
     ]
     wrapped = (piece for line in lines for piece in textwrap.wrap(line, 110, subsequent_indent="    ") or [""])
