@@ -53,34 +53,11 @@ print(table(summarise(before.results), cases, "phase2 on my spacecraft"))
 
 # %% [markdown]
 # ## One of its own
-# The same settings as in notebook 2, with the new task.
+# The settings of notebook 2, with the new task.
 
 # %%
-fast = preset("fast")
-phase1, phase2 = fast.curriculum.phase1.model_dump(), fast.curriculum.phase2.model_dump()
-config = TrainConfig.model_validate(
-    fast.model_dump()
-    | {
-        "preset": "custom",
-        "task": mine.model_dump(),
-        "curriculum": {
-            "phase1": phase1 | {"updates": 4_000 if small else 36_000},
-            # Effort comes late: in so short a phase, the agent must first find its way around the zone.
-            "phase2": phase2
-            | {
-                "updates": 4_000 if small else 36_000,
-                "min_angle_deg": ((0.0, 0.0),),
-                "effort_weight": ((0.0, 0.0), (0.5, 0.0), (1.0, 0.3)),
-            },
-        },
-        "refine": fast.refine.model_dump() | {"iterations": 40 if small else 100},
-        "eval_every": 4_000 if small else 6_000,
-        "eval_cases": 200,
-        "log_every": 2_000,
-        "refine_log_every": 20,
-        "refine_eval_every": 20 if small else 50,
-    }
-)
+short = preset("smoke" if small else "short")
+config = TrainConfig.model_validate(short.model_dump() | {"task": mine.model_dump()})
 agent = train(config, Path("runs", "my-spacecraft"), progress=False)
 assert agent is not None
 
