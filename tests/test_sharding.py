@@ -83,8 +83,8 @@ def test_a_run_on_four_devices_is_like_that_on_one(four):
     assert_like_the_run_on_one_device(RunFolder(four / "run"))
 
 
-def commands(run: Path, *argv: object) -> list[subprocess.Popen[str]]:
-    """Two processes of ``train.py`` with two devices each, begun."""
+def begin(*argv: object) -> list[subprocess.Popen[str]]:
+    """Two processes of ``train.py`` with two devices each."""
     address = f"127.0.0.1:{tiny.free_port()}"
     several = ["--devices", 2, "--cases", 1, "--coordinator", address, "--processes", 2, "--process"]
     variables = tiny.environment() | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
@@ -100,6 +100,17 @@ def commands(run: Path, *argv: object) -> list[subprocess.Popen[str]]:
     ]
 
 
+def end(workers: list[subprocess.Popen[str]], status: int) -> list[str]:
+    """Wait for the processes to end with a status.  Returns what each printed on stderr."""
+    try:
+        errors = [worker.communicate(timeout=300)[1] for worker in workers]
+    finally:
+        for worker in workers:
+            worker.kill()
+    assert [worker.returncode for worker in workers] == [status] * len(workers), errors
+    return errors
+
+
 def rows(folder: RunFolder) -> int:
     """Rows of a log that may be being written."""
     path = folder.path / "metrics.csv"
@@ -110,13 +121,12 @@ def test_two_processes_of_two_devices_train_as_one_device(tmp_path):
     folder = RunFolder(tmp_path / "run")
     # Long enough to be stopped in the second phase, to which the best learner of the first one is handed on.
     changes = ["--refine.iterations", 0, "--curriculum.phase2.updates", 400]
-    workers = commands(folder.path, *tiny.FLAGS, *changes, "--run", folder.path)
-    while rows(folder) < 5 and all(worker.poll() is None for worker in workers):
+    workers = begin(*tiny.FLAGS, *changes, "--run", folder.path)
+    deadline = time.monotonic() + 300
+    while rows(folder) < 5 and all(worker.poll() is None for worker in workers) and time.monotonic() < deadline:
         time.sleep(0.01)
     workers[1].terminate()  # one is told, both stop
-    errors = [worker.communicate(timeout=300)[1] for worker in workers]
-    assert [worker.returncode for worker in workers] == [0, 0], errors
-    assert "stopped; go on with" in errors[0]
+    assert "stopped; go on with" in end(workers, 0)[0]
     assert 5 <= rows(folder) < 29
     # One device goes on from there.
     assert train(folder.read_config(), folder.path, resume=True, progress=False) is not None
@@ -126,9 +136,7 @@ def test_two_processes_of_two_devices_train_as_one_device(tmp_path):
 def test_a_run_that_one_process_refuses_ends_in_all(tmp_path):
     folder = RunFolder(tmp_path / "run")
     (folder.path / "thesis").mkdir(parents=True)
-    workers = commands(folder.path, *tiny.FLAGS, "--run", folder.path)
-    errors = [worker.communicate(timeout=300)[1] for worker in workers]
-    assert [worker.returncode for worker in workers] == [2, 2], errors
+    errors = end(begin(*tiny.FLAGS, "--run", folder.path), 2)
     assert f"run: {folder.path} exists already" in errors[0]
     assert "processes: another process has failed" in errors[1]
     assert [path.name for path in folder.path.iterdir()] == ["thesis"]
