@@ -7,10 +7,10 @@ import jax.numpy as jnp
 from flax import struct
 
 from koz_jax import evaluation, observation
-from koz_jax.agent import ACTION_SIZE
 from koz_jax.controllers.base import Memoryless
 from koz_jax.env import EnvParams, EnvState
 from koz_jax.evaluation import MonteCarloConfig
+from koz_jax.layout import ACTION_SIZE
 from koz_jax.summary import Summary, summarise
 from koz_jax.task_config import TaskConfig
 

@@ -15,7 +15,7 @@ from koz_jax.agent_files import Provenance, Record, find_agent, read_agent_recor
 from koz_jax.config import NetworkConfig
 from koz_jax.controllers.base import Memoryless
 from koz_jax.env import EnvParams, EnvState
-from koz_jax.layout import as_observations
+from koz_jax.layout import ACTION_SIZE, as_observations
 from koz_jax.numpy_policy import NumpyPolicy, from_arrays
 from koz_jax.sac.networks import Params, Policy
 from koz_jax.sb3_policy import is_sb3, read_sb3
@@ -31,8 +31,6 @@ __all__ = [
     "shipped_agents",
     "shipped_folder",
 ]
-
-ACTION_SIZE = 3
 
 
 def policy_network(config: NetworkConfig) -> Policy:

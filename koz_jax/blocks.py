@@ -16,10 +16,9 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.experimental import multihost_utils
 from tqdm import tqdm
 
-from koz_jax import evaluation, storage
+from koz_jax import evaluation, processes, storage
 from koz_jax.controllers.base import Pilot
 from koz_jax.errors import UserError, warn
 from koz_jax.evaluation import MonteCarlo, MonteCarloConfig
@@ -65,25 +64,27 @@ def run_cases(
 
     """
     evaluation.check_feasible(task_config, config.max_angle_deg)
-    processes, process = jax.process_count(), jax.process_index()
-    if processes > 1 and partial is None:
-        raise UserError(f"partial: {processes} processes need a folder that all of them see, got none")
+    count = jax.process_count()
+    if count > 1 and partial is None:
+        raise UserError(f"partial: {count} processes need a folder that all of them see, got none")
     parts = _parts(config, block)
-    mine = parts[process::processes]
+    mine = parts[jax.process_index() :: count]
     with ExitStack() as stack:
         if partial is not None:
-            _check_folder(partial)
-            if process == 0:
-                stack.enter_context(FolderLock(partial, "partial"))
-        shown = progress and len(parts) > 1 and process == 0
+            processes.together(lambda: _open(partial, stack))
+        shown = progress and len(parts) > 1 and processes.leads()
         cases = sum(part.cases for part in mine)
         bar = stack.enter_context(tqdm(total=cases, unit="case", file=sys.stderr, disable=not shown))
-        flown = []
-        for done in _fly(pilot, task_config, mine, partial):
-            flown.append(done)
-            bar.update(len(done.results.settled))
-        if processes > 1:
-            multihost_utils.sync_global_devices("all cases are flown")
+
+        def fly_mine() -> list[_Flown]:
+            found = []
+            for done in _fly(pilot, task_config, mine, partial):
+                found.append(done)
+                bar.update(len(done.results.settled))
+            return found
+
+        flown = processes.together(fly_mine)
+        if count > 1:
             flown = list(_fly(pilot, task_config, parts, partial))  # all are there to be read
     results = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(done.results for done in flown))
     fresh = [done for done in flown if not done.kept]
@@ -94,6 +95,13 @@ def run_cases(
         compile_s=sum(done.compile_s for done in fresh),
         wall_s=sum(done.wall_s for done in flown),
     )
+
+
+def _open(partial: Path, stack: ExitStack) -> None:
+    """Take the folder of blocks: the first process does for all."""
+    if processes.leads():
+        _check_folder(partial)
+        stack.enter_context(FolderLock(partial, "partial"))
 
 
 def _parts(config: MonteCarloConfig, block: int) -> list[MonteCarloConfig]:

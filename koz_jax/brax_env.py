@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 
 from koz_jax import env, observation, reward
-from koz_jax.agent import ACTION_SIZE
 from koz_jax.env import EnvState
 from koz_jax.errors import UserError
+from koz_jax.layout import ACTION_SIZE
 from koz_jax.task_config import TaskConfig
-from koz_jax.vector_env import choose, maneuvers
+from koz_jax.vector_env import maneuvers
 
 # brax prints to stdout, while it is imported, which optional engines it could not find.
 with contextlib.redirect_stdout(io.StringIO()):
@@ -117,7 +117,7 @@ class ResampleWrapper(Wrapper):
 
         def restart() -> tuple[Any, jax.Array]:
             fresh: Any = self.env.reset(_episode_keys(_typed(after.info["key"]), episode))
-            return choose(over, (fresh.pipeline_state, fresh.obs), (after.pipeline_state, after.obs))
+            return env.choose(over, (fresh.pipeline_state, fresh.obs), (after.pipeline_state, after.obs))
 
         # Drawing scenarios costs more than a step, and most steps end no episode.
         pipeline_state, obs = jax.lax.cond(jnp.any(over), restart, lambda: (after.pipeline_state, after.obs))

@@ -1,5 +1,7 @@
 """The reorientation environment of one sample: ``reset`` and ``step``.  Batch it with vmap."""
 
+from typing import TypeVar
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -8,6 +10,8 @@ from koz_jax import dynamics, keep_out, rotations
 from koz_jax.dynamics import RigidBodyState, Spacecraft
 from koz_jax.reward import Outcome, RewardParams
 from koz_jax.scenario import Scenario
+
+Tree = TypeVar("Tree")
 
 
 class EnvParams(struct.PyTreeNode):
@@ -82,3 +86,12 @@ def step(state: EnvState, action: jax.Array, params: EnvParams) -> tuple[EnvStat
         intervention=jnp.zeros(()),
     )
     return next_state, outcome
+
+
+def choose(mask: jax.Array, chosen: Tree, otherwise: Tree) -> Tree:
+    """Take the environments of one tree where ``mask`` (n,) holds, those of another elsewhere."""
+
+    def pick(new: jax.Array, old: jax.Array) -> jax.Array:
+        return jnp.where(mask.reshape((-1,) + (1,) * (new.ndim - 1)), new, old)
+
+    return jax.tree.map(pick, chosen, otherwise)

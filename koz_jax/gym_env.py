@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from koz_jax import extras
-from koz_jax.agent import ACTION_SIZE
 from koz_jax.errors import UserError
+from koz_jax.layout import ACTION_SIZE
 from koz_jax.task_config import TaskConfig
 from koz_jax.vector_env import Fleet, VectorStep, observation_bounds
 
@@ -80,7 +80,6 @@ class ReorientationEnv(gymnasium.Env[Floats, Floats]):
         """Deviations are uniform between the two angles [deg]."""
         task_config = task_config or TaskConfig()
         self._fleet = Fleet(1, task_config, min_angle_deg, max_angle_deg)
-        self._begun = False
         self._next: Floats | None = None  # first observation of the episode to come, when one is over
         self.observation_space, self.action_space = single_spaces(task_config)
 
@@ -88,13 +87,13 @@ class ReorientationEnv(gymnasium.Env[Floats, Floats]):
         """Begin a new random scenario: the first of the seed, or without a seed the next one."""
         _refuse(options)
         super().reset(seed=seed)
-        if seed is None and not self._begun:
+        if seed is None and not self._fleet.begun:
             seed = int(self.np_random.integers(2**32))
         if seed is None and self._next is not None:
             observed = self._next
         else:
             observed = self._fleet.reset(None if seed is None else [seed])[0]
-        self._begun, self._next = True, None
+        self._next = None
         return observed, {}
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
@@ -134,7 +133,6 @@ class ReorientationVectorEnv(VectorEnv[Floats, Floats, npt.NDArray[Any]]):
         """Deviations are uniform between the two angles [deg]."""
         task_config = task_config or TaskConfig()
         self._fleet = Fleet(num_envs, task_config, min_angle_deg, max_angle_deg)
-        self._begun = False
         self.num_envs = num_envs
         self.single_observation_space, self.single_action_space = single_spaces(task_config)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -149,12 +147,10 @@ class ReorientationVectorEnv(VectorEnv[Floats, Floats, npt.NDArray[Any]]):
         """
         _refuse(options)
         super().reset(seed=seed if isinstance(seed, int) else None)
-        if seed is None and not self._begun:
+        if seed is None and not self._fleet.begun:
             seed = self.np_random.integers(2**32, size=self.num_envs).tolist()
         seeds = range(seed, seed + self.num_envs) if isinstance(seed, int) else seed
-        observed = self._fleet.reset(seeds)
-        self._begun = True
-        return observed, {}
+        return self._fleet.reset(seeds), {}
 
     def step(self, actions: Floats) -> tuple[Floats, npt.NDArray[np.float64], Bools, Bools, dict[str, Any]]:
         """Apply actions (num_envs, 3) in [-1, 1] (clipped)."""

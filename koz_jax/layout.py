@@ -13,6 +13,8 @@ import numpy as np
 
 from koz_jax.errors import UserError
 
+ACTION_SIZE = 3  # torque about the body axes, as a share of its limit
+
 _ZONE = {
     "zone_margin": 1,  # [rad] theta_margin
     "zone_angle": 1,  # [rad] theta

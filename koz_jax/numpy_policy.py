@@ -16,10 +16,8 @@ from koz_jax.agent_files import Record, find_agent, read_agent_record
 from koz_jax.config import NetworkConfig
 from koz_jax.encoding import Views, views
 from koz_jax.errors import UserError
-from koz_jax.layout import as_observations, size
+from koz_jax.layout import ACTION_SIZE, as_observations, size
 from koz_jax.task_config import ScenarioConfig
-
-ACTION_SIZE = 3
 
 
 @dataclasses.dataclass(frozen=True)

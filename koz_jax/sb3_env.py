@@ -57,18 +57,16 @@ class ReorientationVecEnv(VecEnv):
         """Deviations are uniform between the two angles [deg]."""
         task_config = task_config or TaskConfig()
         self._fleet = Fleet(num_envs, task_config, min_angle_deg, max_angle_deg)
-        self._begun = False
         super().__init__(num_envs, *single_spaces(task_config))
 
     def reset(self) -> npt.NDArray[np.float32]:
         """Begin new random scenarios: the first of the seeds where ``seed`` was called, else the next ones."""
         if any(self._options):
             raise UserError(f"options: a reset takes none, got {self._options}")
-        if not self._begun and self._seeds[0] is None:
+        if not self._fleet.begun and self._seeds[0] is None:
             self.seed()
         seeds = [seed for seed in self._seeds if seed is not None]
         observed = self._fleet.reset(seeds or None)
-        self._begun = True
         self._reset_seeds()
         return observed
 

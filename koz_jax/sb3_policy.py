@@ -16,8 +16,8 @@ import numpy as np
 from koz_jax.agent_files import Provenance, Record
 from koz_jax.config import NO_ENCODING, NetworkConfig
 from koz_jax.errors import UserError
-from koz_jax.layout import SIZE
-from koz_jax.numpy_policy import ACTION_SIZE, layer_names
+from koz_jax.layout import ACTION_SIZE, SIZE
+from koz_jax.numpy_policy import layer_names
 from koz_jax.task_config import TaskConfig
 
 _LAYER = re.compile(r"actor\.latent_pi\.(\d+)\.weight")

@@ -60,12 +60,17 @@ def make_folder(name: str, path: Path) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
+    """``write_bytes`` for text, in UTF-8."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: Path, content: bytes) -> None:
     """Write a file in one step: readers see the old content or the new, never a part."""
     fresh = _temporary(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with open(fresh, "w", encoding="utf-8", newline="\n") as file:
-            file.write(text)
+        with open(fresh, "wb") as file:
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         os.replace(fresh, path.resolve())

@@ -11,6 +11,7 @@ from koz_jax import curriculum, encoding, env, observation, reward, scenario, sh
 from koz_jax.config import TrainConfig
 from koz_jax.curriculum import Difficulty
 from koz_jax.env import EnvParams, EnvState
+from koz_jax.layout import ACTION_SIZE
 from koz_jax.reward import Outcome, RewardTerms
 from koz_jax.sac import learner as sac_learner
 from koz_jax.sac import replay
@@ -18,8 +19,6 @@ from koz_jax.sac.learner import LearnerMetrics, LearnerState, Sac
 from koz_jax.sac.losses import Batch
 from koz_jax.sac.replay import ReplayBuffer, Transition
 from koz_jax.shield import Shield
-
-ACTION_SIZE = 3
 
 # Training draws scenarios all the time, also at angles where no zone fits; it soon takes what it can get.
 MAX_DRAWS = 8
@@ -118,12 +117,7 @@ def _advance(
     )
 
     def restart() -> EnvState:
-        fresh = _reset_envs(config, params, at, key)
-
-        def choose(new: jax.Array, old: jax.Array) -> jax.Array:
-            return jnp.where(truncated.reshape((-1,) + (1,) * (new.ndim - 1)), new, old)
-
-        return jax.tree.map(choose, fresh, next_states)
+        return env.choose(truncated, _reset_envs(config, params, at, key), next_states)
 
     return jax.lax.cond(jnp.any(truncated), restart, lambda: next_states), transition
 

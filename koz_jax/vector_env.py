@@ -5,7 +5,6 @@ one with seed s flies in its episode k the scenario of ``jax.random.fold_in(jax.
 """
 
 from collections.abc import Sequence
-from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,16 +13,14 @@ import numpy.typing as npt
 from flax import struct
 
 from koz_jax import env, evaluation, keep_out, observation, reward, scenario, task
-from koz_jax.agent import ACTION_SIZE
 from koz_jax.env import EnvParams, EnvState
 from koz_jax.errors import UserError
 from koz_jax.evaluation import MonteCarloConfig
+from koz_jax.layout import ACTION_SIZE
 from koz_jax.scenario import InfeasibleRule, ScenarioRanges
 from koz_jax.task_config import TaskConfig
 
 MAX_ENVS = 2**20
-
-Tree = TypeVar("Tree")
 
 
 class Maneuvers(struct.PyTreeNode):
@@ -53,10 +50,13 @@ class VectorState(struct.PyTreeNode):
 
 
 class VectorStep(struct.PyTreeNode):
-    """What one step of all environments gives.  An environment whose episode is over is already in its next one."""
+    """What one step of all environments gives.  An environment whose episode is over is already in its next one.
 
-    observation: jax.Array  # (n, 16) to act on next: the first of the new episode where the old one is over
-    final_observation: jax.Array  # (n, 16) that the step itself led to
+    Observations have 16 entries, 5 more for each zone above one that a scenario can have.
+    """
+
+    observation: jax.Array  # (n, entries) to act on next: the first of the new episode where the old one is over
+    final_observation: jax.Array  # (n, entries) that the step itself led to
     reward: jax.Array  # (n,) of the paper
     terminated: jax.Array  # (n,) bool, always false: neither settling nor a violation ends a maneuver
     truncated: jax.Array  # (n,) bool, the episode's time is up
@@ -95,7 +95,7 @@ def _margin(flown: Maneuvers, state: EnvState) -> jax.Array:
 def reset(flown: Maneuvers, key: jax.Array, episode: jax.Array) -> tuple[VectorState, jax.Array]:
     """Begin an episode in every environment.
 
-    key: (n,) typed; episode: (n,) int32.  Returns the state and observations (n, 16).
+    key: (n,) typed; episode: (n,) int32.  Returns the state and observations (n, entries).
     """
     begun = jax.vmap(flown.begin)(jax.vmap(jax.random.fold_in)(key, episode))
     margin = jax.vmap(_margin, in_axes=(None, 0))(flown, begun)
@@ -119,7 +119,7 @@ def step(flown: Maneuvers, state: VectorState, action: jax.Array) -> tuple[Vecto
 
     def restart() -> tuple[VectorState, jax.Array]:
         fresh = reset(flown, state.key, state.episode + 1)
-        return choose(truncated, fresh, (going_on, final_observation))
+        return env.choose(truncated, fresh, (going_on, final_observation))
 
     # Drawing scenarios costs more than a step, and most steps end no episode.
     next_state, observed = jax.lax.cond(jnp.any(truncated), restart, lambda: (going_on, final_observation))
@@ -134,15 +134,6 @@ def step(flown: Maneuvers, state: VectorState, action: jax.Array) -> tuple[Vecto
         settled=reward.is_settled(after.angle, params.reward),
         violated=min_margin <= 0.0,
     )
-
-
-def choose(mask: jax.Array, chosen: Tree, otherwise: Tree) -> Tree:
-    """Take the environments of one tree where ``mask`` (n,) holds, those of another elsewhere."""
-
-    def pick(new: jax.Array, old: jax.Array) -> jax.Array:
-        return jnp.where(mask.reshape((-1,) + (1,) * (new.ndim - 1)), new, old)
-
-    return jax.tree.map(pick, chosen, otherwise)
 
 
 class Fleet:
@@ -162,10 +153,15 @@ class Fleet:
         self._maneuvers = maneuvers(task_config, min_angle_deg, max_angle_deg)
         self._state: VectorState | None = None
 
+    @property
+    def begun(self) -> bool:
+        """Whether there was a first reset."""
+        return self._state is not None
+
     def reset(self, seeds: Sequence[int] | None = None) -> npt.NDArray[np.float32]:
         """Begin the first episode of every seed, or with None the next one of the seeds that are set.
 
-        seeds: one per environment, from 0 to 2^32 - 1.  Returns observations (n, 16).
+        seeds: one per environment, from 0 to 2^32 - 1.  Returns observations (n, entries).
         """
         if seeds is not None:
             key, episode = _keys(seeds, self.num_envs), jnp.zeros(self.num_envs, jnp.int32)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from koz_jax import storage
 from koz_jax.errors import UserError, exit_status
 from koz_jax.shield_config import ShieldConfig
 
@@ -43,7 +43,6 @@ def main(argv: list[str]) -> int:
 
 def _export(args: ExportArgs) -> int:
     # jax is imported only now: --help and flags that do not exist are answered at once.
-    from koz_jax import storage
     from koz_jax.agent import load_agent
 
     if args.shield and args.to != "c":
@@ -83,18 +82,10 @@ def export(agent: Agent, to: Literal["c", "onnx", "stablehlo"], shield: ShieldCo
 
 
 def write_files(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
-    """Write files, each in one step: readers see the old content or the new.  Returns their paths."""
-    paths = []
+    """Write files, each in one step.  Returns their paths."""
     for name, content in files.items():
-        path, fresh = folder / name, folder / f".{name}.{os.getpid()}"
-        try:
-            fresh.write_bytes(content)
-            os.replace(fresh, path)
-        except OSError as error:
-            fresh.unlink(missing_ok=True)
-            raise UserError(f"out: {path} cannot be written: {error.strerror or error}") from None
-        paths.append(path)
-    return paths
+        storage.write_bytes(folder / name, content)
+    return [folder / name for name in files]
 
 
 if __name__ == "__main__":

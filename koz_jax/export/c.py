@@ -8,8 +8,8 @@ import numpy as np
 from koz_jax import dynamics, shield, task
 from koz_jax.export.golden import Golden
 from koz_jax.export.metadata import Metadata, as_text, describe
-from koz_jax.layout import size
-from koz_jax.numpy_policy import ACTION_SIZE, NumpyPolicy, told_zones
+from koz_jax.layout import ACTION_SIZE, size
+from koz_jax.numpy_policy import NumpyPolicy, told_zones
 from koz_jax.shield_config import ShieldConfig
 
 # 1e-5 of the action's range, which is 2.

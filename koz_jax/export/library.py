@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from koz_jax.errors import UserError
-from koz_jax.numpy_policy import ACTION_SIZE
+from koz_jax.layout import ACTION_SIZE
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 

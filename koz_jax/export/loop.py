@@ -9,7 +9,7 @@ from flax import struct
 from koz_jax import observation
 from koz_jax.controllers.base import Memoryless
 from koz_jax.env import EnvParams, EnvState
-from koz_jax.numpy_policy import ACTION_SIZE
+from koz_jax.layout import ACTION_SIZE
 
 
 class HostController(Memoryless):

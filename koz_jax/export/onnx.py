@@ -6,7 +6,8 @@ import numpy as np
 
 from koz_jax.errors import UserError
 from koz_jax.export.metadata import describe
-from koz_jax.numpy_policy import ACTION_SIZE, NumpyPolicy
+from koz_jax.layout import ACTION_SIZE
+from koz_jax.numpy_policy import NumpyPolicy
 
 try:
     import onnx
