@@ -8,7 +8,8 @@ from koz_jax.summary import PAPER_TABLE
 _INTRO = """# Peers
 
 Made by `python benchmarks/peers.py` (extra `peers`), which trains every library on the same environment, one after
-another on the same cores, each in a process of its own; do not edit. Numbers behind it: [`peers.json`](peers.json).
+another on the same cores, each in a process of its own; do not edit. A peer that a run is not asked for (`--peers`)
+keeps its result of before. Numbers behind it: [`peers.json`](peers.json).
 
 Every peer trains on deviations of 80 to 180 deg with the paper's reward and observation, with networks of 256-256 and
 batches of 256, through its best wrapper of the environment. Beyond that it has the settings of the table, mostly its
@@ -65,6 +66,7 @@ def _learning(report: Report) -> str:
 
 def _monte_carlo(report: Report) -> str:
     rows = [["", *(result.name for result in report.results), "paper"]]
+    rows.append(["training [min]", *(f"{result.minutes:g}" for result in report.results), "-"])
     for label, field, factor, form in _ROWS:
 
         def cell(value: float | None, factor: float = factor, form: str = form) -> str:
@@ -117,7 +119,7 @@ def markdown(report: Report) -> str:
         " between two evaluations; for koz_jax measured apart, because its preset has networks of 128-128."
         " PPO's updates are of 512 unrolls of 20 steps, not of 256 transitions.",
         _bound(report),
-        "## Monte Carlo after equal time\n\n" + _monte_carlo(report),
+        "## Monte Carlo after the training\n\n" + _monte_carlo(report),
         "\\* settled cases only. Of each peer the best policy by its evaluations, in"
         f" {max((result.cases for result in report.results), default=0):,} cases, seed 0 of `eval_mc.py`.",
         "## Settings\n\n" + _settings(report),

@@ -1,7 +1,8 @@
 """Several seeds at once: one worker process per core, each an ordinary run in a folder of its own.
 
-A CPU core per run is the fastest way on CPUs: a run's matrix products are too small to gain from a second core.  Every
-run gives the bits that ``train.py --seed`` gives on one core.
+A CPU core per run is the fastest way on CPUs: a second core makes a single run only a third faster
+(``benchmarks/scaling.py``), since its matrix products are small.  Every run gives the bits that ``train.py --seed``
+gives on one core.
 """
 
 import concurrent.futures

@@ -1,8 +1,6 @@
 """Training on several devices, in one process or in several: the same as on one up to rounding."""
 
 import itertools
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -20,6 +18,7 @@ from koz_jax.run_folder import RunFolder
 from koz_jax.trainer import train
 
 STEPS = 4
+ONE_CASE = ["--devices", 2, "--cases", 1]
 
 # Some steps on four devices, from the state that one device begins with; then a whole run.
 TRAIN = """
@@ -83,34 +82,6 @@ def test_a_run_on_four_devices_is_like_that_on_one(four):
     assert_like_the_run_on_one_device(RunFolder(four / "run"))
 
 
-def begin(*argv: object) -> list[subprocess.Popen[str]]:
-    """Two processes of ``train.py`` with two devices each."""
-    address = f"127.0.0.1:{tiny.free_port()}"
-    several = ["--devices", 2, "--cases", 1, "--coordinator", address, "--processes", 2, "--process"]
-    variables = tiny.environment() | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
-    return [
-        subprocess.Popen(
-            [sys.executable, "train.py", *map(str, [*argv, *several, number])],
-            env=variables,
-            cwd=tiny.ROOT,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for number in range(2)
-    ]
-
-
-def end(workers: list[subprocess.Popen[str]], status: int) -> list[str]:
-    """Wait for the processes to end with a status.  Returns what each printed on stderr."""
-    try:
-        errors = [worker.communicate(timeout=300)[1] for worker in workers]
-    finally:
-        for worker in workers:
-            worker.kill()
-    assert [worker.returncode for worker in workers] == [status] * len(workers), errors
-    return errors
-
-
 def rows(folder: RunFolder) -> int:
     """Rows of a log that may be being written."""
     path = folder.path / "metrics.csv"
@@ -121,12 +92,12 @@ def test_two_processes_of_two_devices_train_as_one_device(tmp_path):
     folder = RunFolder(tmp_path / "run")
     # Long enough to be stopped in the second phase, to which the best learner of the first one is handed on.
     changes = ["--refine.iterations", 0, "--curriculum.phase2.updates", 400]
-    workers = begin(*tiny.FLAGS, *changes, "--run", folder.path)
+    workers = tiny.begin_two("train.py", *tiny.FLAGS, *changes, *ONE_CASE, "--run", folder.path)
     deadline = time.monotonic() + 300
     while rows(folder) < 5 and all(worker.poll() is None for worker in workers) and time.monotonic() < deadline:
         time.sleep(0.01)
     workers[1].terminate()  # one is told, both stop
-    assert "stopped; go on with" in end(workers, 0)[0]
+    assert "stopped; go on with" in tiny.ended(workers, 0)[0]
     assert 5 <= rows(folder) < 29
     # One device goes on from there.
     assert train(folder.read_config(), folder.path, resume=True, progress=False) is not None
@@ -136,7 +107,7 @@ def test_two_processes_of_two_devices_train_as_one_device(tmp_path):
 def test_a_run_that_one_process_refuses_ends_in_all(tmp_path):
     folder = RunFolder(tmp_path / "run")
     (folder.path / "thesis").mkdir(parents=True)
-    errors = end(begin(*tiny.FLAGS, "--run", folder.path), 2)
+    errors = tiny.ended(tiny.begin_two("train.py", *tiny.FLAGS, *ONE_CASE, "--run", folder.path), 2)
     assert f"run: {folder.path} exists already" in errors[0]
     assert "processes: another process has failed" in errors[1]
     assert [path.name for path in folder.path.iterdir()] == ["thesis"]

@@ -130,6 +130,33 @@ def free_port() -> int:
         return server.getsockname()[1]
 
 
+def begin_two(*command: object) -> list[subprocess.Popen[str]]:
+    """Begin a Python command in two processes of two devices each, which find each other by its last arguments."""
+    several = ["--coordinator", f"127.0.0.1:{free_port()}", "--processes", 2, "--process"]
+    variables = environment() | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    return [
+        subprocess.Popen(
+            [sys.executable, *map(str, [*command, *several, number])],
+            env=variables,
+            cwd=ROOT,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for number in range(2)
+    ]
+
+
+def ended(workers: list[subprocess.Popen[str]], status: int) -> list[str]:
+    """Wait for processes to end with a status.  Returns what each printed on stderr."""
+    try:
+        errors = [worker.communicate(timeout=300)[1] for worker in workers]
+    finally:
+        for worker in workers:
+            worker.kill()
+    assert [worker.returncode for worker in workers] == [status] * len(workers), errors
+    return errors
+
+
 def contents(folder: Path) -> dict[Path, bytes | None]:
     """Everything in a folder."""
     return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
