@@ -4,11 +4,11 @@ With one process everything here is plain: it leads, and nothing is exchanged.
 """
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
-from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from koz_jax.errors import UserError
 
@@ -22,16 +22,41 @@ def leads() -> bool:
 
 def any_of(flag: bool) -> bool:
     """Whether the flag is up in any process; waits until all have said so."""
-    if jax.process_count() == 1:
-        return flag
-    return bool(np.any(multihost_utils.process_allgather(np.bool_(flag))))
+    return bool(_of_all(np.bool_(flag)).any())
 
 
-def from_first(value: float) -> float:
-    """The first process's value, in float32, in every process."""
+def from_first(tree: Any) -> Any:
+    """Replace a pytree of arrays by that of the first process, in NumPy; all have the same shapes and types."""
+    return jax.tree.map(lambda stacked: stacked[0], _of_all(tree))
+
+
+def _of_all(tree: Any) -> Any:
+    """Stack what every process has, leaf by leaf.  Waits for all of them."""
+    mine = jax.tree.map(lambda leaf: np.asarray(leaf)[None], tree)
     if jax.process_count() == 1:
-        return value
-    return float(multihost_utils.broadcast_one_to_all(np.float32(value)))
+        return mine
+    mesh = Mesh(np.array([jax.local_devices(process)[0] for process in range(jax.process_count())]), ("processes",))
+    divided = NamedSharding(mesh, PartitionSpec("processes"))
+    return whole(jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(divided, leaf), mine), mesh)
+
+
+def whole(tree: Any, mesh: Mesh) -> Any:
+    """Make a pytree whose leaves are divided among the devices of a mesh whole, as NumPy arrays, in every process."""
+    copies = jax.jit(_same, out_shardings=NamedSharding(mesh, PartitionSpec()))(tree)
+    return jax.tree.map(lambda leaf: np.asarray(leaf.addressable_data(0)), finished(copies))
+
+
+def _same(tree: Any) -> Any:
+    return tree
+
+
+def finished(tree: Any) -> Any:
+    """Wait until all devices of this process have computed a pytree, and return it.
+
+    A device that is ahead must not begin the next exchange while its neighbour still has to begin this one: processes
+    whose devices take them in different orders wait for each other for ever.
+    """
+    return jax.block_until_ready(tree)
 
 
 def raise_together(error: UserError | None) -> None:

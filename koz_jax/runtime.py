@@ -1,11 +1,15 @@
 """Process-wide settings of jax for the command lines; libraries and notebooks are left alone."""
 
 import os
+import sys
 from pathlib import Path
+from types import TracebackType
 
 import jax
 
 from koz_jax.errors import UserError
+
+_DAY = 86_400  # seconds
 
 
 def configure() -> None:
@@ -34,7 +38,8 @@ def keep_programs() -> None:
 def join(coordinator: str, processes: int, process: int) -> None:
     """Make this process one of several that work together, on this machine or on many.
 
-    Call after ``configure`` and before anything touches a device.
+    Call after ``configure`` and before anything touches a device.  A process that has finished waits for the others; an
+    exception that nobody catches ends it at once, and the others when they notice, within two minutes.
 
     Args:
         coordinator: address of the first process, as host:port.
@@ -46,6 +51,14 @@ def join(coordinator: str, processes: int, process: int) -> None:
 
     """
     try:
-        jax.distributed.initialize(coordinator, processes, process)
+        jax.distributed.initialize(coordinator, processes, process, shutdown_timeout_seconds=_DAY)
     except (RuntimeError, ValueError) as error:
         raise UserError(f"coordinator: {coordinator} cannot be joined: {str(error).splitlines()[0]}") from None
+    sys.excepthook = _leave
+
+
+def _leave(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """Show an exception and end, without waiting for the others: they may be waiting for this process."""
+    sys.__excepthook__(kind, error, trace)
+    sys.stderr.flush()
+    os._exit(1)

@@ -13,8 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from koz_jax import processes, storage
 from koz_jax.config import TrainConfig
 from koz_jax.errors import UserError
+from koz_jax.sac.replay import ReplayBuffer
 from koz_jax.training import TrainState
 
 _AXIS = "environments"
@@ -30,9 +32,9 @@ def check(config: TrainConfig, devices: int) -> None:
     present = len(jax.local_devices())
     if not 1 <= devices <= present:
         raise UserError(f"devices: must be from 1 to {present}, the devices that there are; got {devices}")
-    processes = jax.process_count()
-    if config.num_envs % (processes * devices):
-        of_all = f" on each of {processes} processes" if processes > 1 else ""
+    count = jax.process_count()
+    if config.num_envs % (count * devices):
+        of_all = f" on each of {count} processes" if count > 1 else ""
         raise UserError(f"devices: must divide num_envs = {config.num_envs}; got {devices}{of_all}")
 
 
@@ -44,31 +46,40 @@ def _mesh(devices: int) -> Mesh:
     return Mesh(np.array(chosen), (_AXIS,))
 
 
-def _put(leaf: jax.Array, sharding: NamedSharding) -> jax.Array:
-    """Put an array where it belongs; typed keys, which cannot be divided among processes, as their data."""
-    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-        return jax.random.wrap_key_data(jax.device_put(jax.random.key_data(leaf), sharding))
-    return jax.device_put(leaf, sharding)
+def _put(tree: Any, sharding: NamedSharding) -> Any:
+    """Put a pytree that every process has where it belongs; each keeps its own share."""
+
+    def put(leaf: jax.Array | np.ndarray) -> jax.Array:
+        if isinstance(leaf, jax.Array) and leaf.sharding == sharding:
+            return leaf
+        data = np.asarray(leaf)
+        return jax.make_array_from_callback(data.shape, sharding, lambda index: data[index])
+
+    return jax.tree.map(put, tree)
 
 
 def place(state: TrainState, devices: int) -> TrainState:
     """Divide a training state among the first ``devices`` devices of every process; on a single one it stays as it is.
 
-    The state is whole and the same in every process, or was placed before.
+    The state is whole in every process, or was placed before.
     """
     if devices * jax.process_count() == 1:
         return state
     mesh = _mesh(devices)
-
-    def put(tree: Any, *axes: str | None) -> Any:
-        return jax.tree.map(lambda leaf: _put(leaf, NamedSharding(mesh, PartitionSpec(*axes))), tree)
-
+    everywhere, by_row, by_column = (
+        NamedSharding(mesh, PartitionSpec(*axes)) for axes in ((), (_AXIS,), (None, _AXIS))
+    )
+    shared = (state.learner, state.buffer.head, state.buffer.size, jax.random.key_data(state.key), state.updates)
+    if any(leaf.sharding != everywhere for leaf in jax.tree.leaves(shared)):
+        # Other machines round in other ways.
+        shared = _put(processes.from_first(shared), everywhere)
+    learner, head, size, key, updates = shared
     return TrainState(
-        learner=put(state.learner),
-        buffer=put(state.buffer).replace(rows=put(state.buffer.rows, None, _AXIS)),
-        env_states=put(state.env_states, _AXIS),
-        key=put(state.key),
-        updates=put(state.updates),
+        learner=learner,
+        buffer=ReplayBuffer(rows=_put(state.buffer.rows, by_column), head=head, size=size),
+        env_states=_put(state.env_states, by_row),
+        key=jax.random.wrap_key_data(key),
+        updates=updates,
     )
 
 
@@ -78,12 +89,8 @@ def whole(tree: Any, devices: int) -> Any:
 
 
 def gather(tree: Any) -> Any:
-    """Make what is divided among processes whole in each of them, on one device.  All processes call it together."""
-
-    def local(leaf: jax.Array) -> jax.Array:
-        if leaf.is_fully_addressable:
-            return leaf
-        everywhere = NamedSharding(leaf.sharding.mesh, PartitionSpec())  # pyright: ignore[reportAttributeAccessIssue]
-        return _put(leaf, everywhere).addressable_data(0)
-
-    return jax.tree.map(local, tree)
+    """Make what is divided among processes whole in each of them, typed keys as their data.  All call it together."""
+    leaves, structure = jax.tree.flatten(storage.key_data(tree))
+    divided = [leaf for leaf in leaves if not leaf.is_fully_addressable]
+    gathered = iter(processes.whole(divided, divided[0].sharding.mesh) if divided else ())
+    return structure.unflatten([leaf if leaf.is_fully_addressable else next(gathered) for leaf in leaves])

@@ -220,7 +220,7 @@ class _Run:
         end = self._chunk_end(done, self.config.log_every)
         steps = (end - done) // self.config.updates_per_step
         placed = sharding.place(state.train, self.devices)
-        train_state, metrics = training.train_chunk(self.config, placed, np.int32(steps))
+        train_state, metrics = processes.finished(training.train_chunk(self.config, placed, np.int32(steps)))
         metrics = jax.device_get(metrics)
         watch.check(end, int(metrics.fault), {"learner": train_state.learner, "environments": train_state.env_states})
         warning = watch.divergence(self.config, metrics.learner)
@@ -255,7 +255,7 @@ class _Run:
             else state.best.replace(averaged_policy=state.refine.policy)
         )
         judged = self._judge(learner, phase) if processes.leads() else {"eval/score": math.nan}
-        found = processes.from_first(judged["eval/score"])
+        found = float(processes.from_first(np.float32(judged["eval/score"])))
         watch.check(done, watch.SOUND, {"eval/score": jnp.float32(found)})
         if found > float(state.best_score):
             best = jax.tree.map(jnp.copy, learner)

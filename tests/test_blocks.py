@@ -202,7 +202,7 @@ def test_two_processes_of_two_devices_give_the_results_of_one(single, tmp_path):
 
 def test_a_folder_that_one_process_refuses_ends_in_all(tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
-    errors = tiny.ended(tiny.begin_two("eval_mc.py", "--cases", 600, "--partial", tmp_path), 2)
+    errors = tiny.ended(tiny.begin_two("eval_mc.py", "--cases", 600, "--partial", tmp_path), 2, 2)
     assert "holds other things (thesis.tex)" in errors[0]
     assert "processes: another process has failed" in errors[1]
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]

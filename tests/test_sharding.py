@@ -93,11 +93,11 @@ def test_two_processes_of_two_devices_train_as_one_device(tmp_path):
     # Long enough to be stopped in the second phase, to which the best learner of the first one is handed on.
     changes = ["--refine.iterations", 0, "--curriculum.phase2.updates", 400]
     workers = tiny.begin_two("train.py", *tiny.FLAGS, *changes, *ONE_CASE, "--run", folder.path)
-    deadline = time.monotonic() + 300
+    deadline = time.monotonic() + 200
     while rows(folder) < 5 and all(worker.poll() is None for worker in workers) and time.monotonic() < deadline:
         time.sleep(0.01)
     workers[1].terminate()  # one is told, both stop
-    assert "stopped; go on with" in tiny.ended(workers, 0)[0]
+    assert "stopped; go on with" in tiny.ended(workers, 0, 0)[0]
     assert 5 <= rows(folder) < 29
     # One device goes on from there.
     assert train(folder.read_config(), folder.path, resume=True, progress=False) is not None
@@ -107,7 +107,7 @@ def test_two_processes_of_two_devices_train_as_one_device(tmp_path):
 def test_a_run_that_one_process_refuses_ends_in_all(tmp_path):
     folder = RunFolder(tmp_path / "run")
     (folder.path / "thesis").mkdir(parents=True)
-    errors = tiny.ended(tiny.begin_two("train.py", *tiny.FLAGS, *ONE_CASE, "--run", folder.path), 2)
+    errors = tiny.ended(tiny.begin_two("train.py", *tiny.FLAGS, *ONE_CASE, "--run", folder.path), 2, 2)
     assert f"run: {folder.path} exists already" in errors[0]
     assert "processes: another process has failed" in errors[1]
     assert [path.name for path in folder.path.iterdir()] == ["thesis"]

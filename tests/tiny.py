@@ -3,6 +3,7 @@
 import functools
 import importlib.util
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -133,11 +134,11 @@ def free_port() -> int:
 def begin_two(*command: object) -> list[subprocess.Popen[str]]:
     """Begin a Python command in two processes of two devices each, which find each other by its last arguments."""
     several = ["--coordinator", f"127.0.0.1:{free_port()}", "--processes", 2, "--process"]
-    variables = environment() | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    forced = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "PYTHONFAULTHANDLER": "1"}
     return [
         subprocess.Popen(
             [sys.executable, *map(str, [*command, *several, number])],
-            env=variables,
+            env=environment() | forced,
             cwd=ROOT,
             stderr=subprocess.PIPE,
             text=True,
@@ -146,14 +147,17 @@ def begin_two(*command: object) -> list[subprocess.Popen[str]]:
     ]
 
 
-def ended(workers: list[subprocess.Popen[str]], status: int) -> list[str]:
-    """Wait for processes to end with a status.  Returns what each printed on stderr."""
-    try:
-        errors = [worker.communicate(timeout=300)[1] for worker in workers]
-    finally:
-        for worker in workers:
-            worker.kill()
-    assert [worker.returncode for worker in workers] == [status] * len(workers), errors
+def ended(workers: list[subprocess.Popen[str]], *status: int) -> list[str]:
+    """Wait for processes to end, each with its status.  Returns what each printed on stderr."""
+    errors = []
+    for worker in workers:
+        try:
+            errors.append(worker.communicate(timeout=200)[1])
+        except subprocess.TimeoutExpired:
+            for late in workers:
+                late.send_signal(signal.SIGABRT)  # says where it waits
+            errors.append(worker.communicate()[1])
+    assert [worker.returncode for worker in workers] == list(status), "\n".join(errors)
     return errors
 
 
