@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from koz_jax import storage
+from koz_jax import processes, storage
 from koz_jax.config import TrainConfig
 from koz_jax.errors import UserError
 from koz_jax.reward import PAPER_WEIGHTS, RewardTerms
@@ -86,7 +86,7 @@ def check(done: int, fault: int, state: Any) -> None:
     if fault != SOUND:
         name = fault_name(fault)
     else:
-        flags = storage.named_leaves(jax.device_get(_sound(state)))
+        flags = storage.named_leaves(jax.device_get(processes.finished(_sound(state))))
         broken = [name for name, sound in flags.items() if not sound]
         if not broken:
             return
