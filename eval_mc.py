@@ -15,7 +15,7 @@ from koz_jax.process_args import ProcessArgs
 
 if TYPE_CHECKING:
     from koz_jax.controllers.base import Pilot
-    from koz_jax.evaluation import MonteCarloConfig
+    from koz_jax.evaluation import MonteCarlo, MonteCarloConfig
     from koz_jax.task_config import TaskConfig
 
 
@@ -107,12 +107,17 @@ def _replay(pilot: Pilot, task: TaskConfig, config: MonteCarloConfig, case: int,
 
 
 def _monte_carlo(pilot: Pilot, task: TaskConfig, config: MonteCarloConfig, args: EvalArgs) -> None:
-    from koz_jax import blocks, evaluation, storage, tables
-    from koz_jax.summary import summarise, table
+    from koz_jax import blocks, processes
 
     flown = blocks.run_cases(pilot, task, config, partial=args.partial)
-    if args.process > 0:
-        return
+    # The others wait for the first, which reports.
+    processes.together(lambda: None if args.process > 0 else _report(flown, task, config, args))
+
+
+def _report(flown: MonteCarlo, task: TaskConfig, config: MonteCarloConfig, args: EvalArgs) -> None:
+    from koz_jax import evaluation, storage, tables
+    from koz_jax.summary import summarise, table
+
     summary = summarise(flown.results)
     print(table(summary, config.cases, args.name, args.shield))
     print(f"compiled in {flown.compile_s:.1f} s, flown in {flown.wall_s:.1f} s")

@@ -1,5 +1,7 @@
 """Train a controller: ``python train.py`` (some minutes), ``python train.py --help`` for every setting."""
 
+from __future__ import annotations
+
 import argparse
 import dataclasses
 import os
@@ -7,12 +9,16 @@ import shlex
 import sys
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from koz_jax import flags
 from koz_jax.config import TrainConfig
 from koz_jax.errors import UserError, exit_status
 from koz_jax.presets import preset
 from koz_jax.process_args import ProcessArgs
+
+if TYPE_CHECKING:
+    from koz_jax.agent import Agent
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,9 +75,8 @@ def main(argv: list[str]) -> int:
 
 def _train(config: TrainConfig, args: RunArgs) -> int:
     # jax is imported only now: a bad flag is refused before it costs a second.
-    from koz_jax import evaluation, runtime, storage
+    from koz_jax import processes, runtime
     from koz_jax.run_folder import RunFolder
-    from koz_jax.summary import summarise, table
     from koz_jax.trainer import train
 
     run = args.resume or args.run or Path("runs", time.strftime(f"{config.preset}-seed{config.seed}-%Y%m%d-%H%M%S"))
@@ -82,14 +87,21 @@ def _train(config: TrainConfig, args: RunArgs) -> int:
     if args.resume:
         config = RunFolder(run).read_config()
     agent = train(config, run, resume=args.resume is not None, start_from=args.start_from, devices=args.devices)
-    if args.process > 0:
-        return 0
+    # The others wait for the first, which reports.
+    return processes.together(lambda: 0 if args.process > 0 else _report(agent, args.cases, run))
+
+
+def _report(agent: Agent | None, cases: int, run: Path) -> int:
+    from koz_jax import evaluation, storage
+    from koz_jax.run_folder import RunFolder
+    from koz_jax.summary import summarise, table
+
     if agent is None:
         return _stopped(run)
-    flown = evaluation.monte_carlo(agent, args.cases)
+    flown = evaluation.monte_carlo(agent, cases)
     summary = summarise(flown.results)
     storage.write_json(RunFolder(run).evaluation, evaluation.report(flown, summary))
-    print(table(summary, args.cases, run.resolve().name))
+    print(table(summary, cases, run.resolve().name))
     print(f"\nlook further: python eval_mc.py --agent {shlex.quote(str(run))} --csv cases.csv")
     return 0
 

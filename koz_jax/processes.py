@@ -40,6 +40,16 @@ def _of_all(tree: Any) -> Any:
     return whole(jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(divided, leaf), mine), mesh)
 
 
+def connect(mesh: Mesh) -> None:
+    """Connect the devices of a mesh now, while all processes are there.
+
+    They would be connected in their first exchange, but for that a process on CPUs waits half a minute at most, and
+    another may have to compile for longer.  Later exchanges wait for half an hour.
+    """
+    sharding = NamedSharding(mesh, PartitionSpec(mesh.axis_names))
+    whole(jax.make_array_from_callback((mesh.size,), sharding, lambda index: np.zeros(mesh.size)[index]), mesh)
+
+
 def whole(tree: Any, mesh: Mesh) -> Any:
     """Make a pytree whose leaves are divided among the devices of a mesh whole, as NumPy arrays, in every process."""
     copies = jax.jit(_same, out_shardings=NamedSharding(mesh, PartitionSpec()))(tree)

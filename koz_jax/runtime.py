@@ -8,8 +8,7 @@ from types import TracebackType
 import jax
 
 from koz_jax.errors import UserError
-
-_DAY = 86_400  # seconds
+from koz_jax.processes import any_of
 
 
 def configure() -> None:
@@ -38,8 +37,8 @@ def keep_programs() -> None:
 def join(coordinator: str, processes: int, process: int) -> None:
     """Make this process one of several that work together, on this machine or on many.
 
-    Call after ``configure`` and before anything touches a device.  A process that has finished waits for the others; an
-    exception that nobody catches ends it at once, and the others when they notice, within two minutes.
+    Call after ``configure`` and before anything touches a device.  A process that ends waits up to five minutes for the
+    others.  An exception that nobody catches ends it at once, and the others when they notice, within two minutes.
 
     Args:
         coordinator: address of the first process, as host:port.
@@ -51,10 +50,11 @@ def join(coordinator: str, processes: int, process: int) -> None:
 
     """
     try:
-        jax.distributed.initialize(coordinator, processes, process, shutdown_timeout_seconds=_DAY)
+        jax.distributed.initialize(coordinator, processes, process)
     except (RuntimeError, ValueError) as error:
         raise UserError(f"coordinator: {coordinator} cannot be joined: {str(error).splitlines()[0]}") from None
     sys.excepthook = _leave
+    any_of(False)  # connects them, see ``processes.connect``
 
 
 def _leave(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:

@@ -69,16 +69,20 @@ def place(state: TrainState, devices: int) -> TrainState:
     everywhere, by_row, by_column = (
         NamedSharding(mesh, PartitionSpec(*axes)) for axes in ((), (_AXIS,), (None, _AXIS))
     )
-    shared = (state.learner, state.buffer.head, state.buffer.size, jax.random.key_data(state.key), state.updates)
+    shared = (state.learner, state.buffer.head, state.buffer.size, state.updates, state.key)
     if any(leaf.sharding != everywhere for leaf in jax.tree.leaves(shared)):
-        # Other machines round in other ways.
-        shared = _put(processes.from_first(shared), everywhere)
-    learner, head, size, key, updates = shared
+        # Those of the first process: other machines round in other ways.
+        *others, key_data = processes.from_first(storage.key_data(shared))
+        processes.connect(mesh)
+        # Spelled as a training step spells it, which would be compiled for another spelling once more.
+        key = jax.random.wrap_key_data(_put(key_data, NamedSharding(mesh, PartitionSpec(None))))
+        shared = (*_put(others, everywhere), key)
+    learner, head, size, updates, key = shared
     return TrainState(
         learner=learner,
         buffer=ReplayBuffer(rows=_put(state.buffer.rows, by_column), head=head, size=size),
         env_states=_put(state.env_states, by_row),
-        key=jax.random.wrap_key_data(key),
+        key=key,
         updates=updates,
     )
 

@@ -31,11 +31,14 @@ assert jax.local_device_count() == 4
 folder = pathlib.Path(sys.argv[1])
 state = sharding.place(training.init(CONFIG, jax.random.key(0)), 4)
 for _ in range(2):
-    state, metrics = training.train_chunk(CONFIG, sharding.place(state, 4), jnp.int32(int(sys.argv[2])))
+    state, metrics = training.train_chunk(CONFIG, state, jnp.int32(int(sys.argv[2])))
+    placed = sharding.place(state, 4)
+    assert all(one is other for one, other in zip(*map(jax.tree.leaves, (placed, state)), strict=True))  # at no cost
     for leaf in (state.buffer.rows.observation, state.buffer.rows.truncated, state.env_states.body.q_BN):
         shards = leaf.addressable_shards
         assert len({shard.device for shard in shards}) == 4
         assert sum(shard.data.size for shard in shards) == leaf.size  # divided, not copied
+assert training.train_chunk._cache_size() == 1
 storage.save_tree(folder / "state", (state, metrics), {})
 assert train(UNREFINED, folder / "run", progress=False, devices=4) is not None
 """
