@@ -286,6 +286,12 @@ class TrainConfig(Settings):
             )
         return self
 
+    @model_validator(mode="after")
+    def _can_be_shielded(self) -> Self:
+        if self.shielding.enabled:
+            self.shielding.shield.check(self.task.spacecraft.torque_limit)
+        return self
+
     def to_json(self) -> str:
         """What ``config.json`` of a run holds."""
         return self.model_dump_json(indent=2) + "\n"

@@ -119,6 +119,8 @@ def _draw(task_config: TaskConfig, config: MonteCarloConfig) -> _Draw:
 def conditions(task_config: TaskConfig, config: MonteCarloConfig) -> Conditions:
     """Make the shield and the uncertainty that the settings ask for."""
     params = task.env_params(task_config)
+    if config.shield:
+        config.shield.check(task_config.spacecraft.torque_limit)
     return Conditions(
         shield=shield.for_spacecraft(config.shield, params.spacecraft, params.dt) if config.shield else None,
         uncertainty=uncertainty.from_config(config.uncertainty) if config.uncertainty else None,

@@ -101,11 +101,9 @@ class FlightArgs:
     def task(self, pilot: Pilot) -> TaskConfig:
         """What is flown: the task that the pilot was made for, with the changes that the flags ask for."""
         task = pilot.task.with_rules(self.angle_convention, self.infeasible_zone, self.zones, self.max_rate_deg)
-        if self.robust and self.disturbance_torque >= task.spacecraft.torque_limit:
-            raise UserError(
-                f"disturbance_torque: must be below the torque limit of {task.spacecraft.torque_limit} N m for the"
-                f" shield to withstand it, got {self.disturbance_torque}"
-            )
+        shield = self.config().shield
+        if shield is not None:
+            shield.check(task.spacecraft.torque_limit)
         return task
 
     @property

@@ -7,7 +7,9 @@ Importing this module registers it::
     env = gymnasium.make("koz_jax/Reorientation-v0")
     envs = gymnasium.make_vec("koz_jax/Reorientation-v0", num_envs=1024)
 
-or, without the import, ``gymnasium.make("koz_jax.gym_env:koz_jax/Reorientation-v0")``.
+or, without the import, ``gymnasium.make("koz_jax.gym_env:koz_jax/Reorientation-v0")``.  The vector environment needs no
+processes; those of ``vectorization_mode="async"`` must be spawned (``vector_kwargs={"context": "spawn"}``), because jax
+does not live through a fork.
 
 Both take ``task_config``, ``min_angle_deg`` and ``max_angle_deg`` (initial deviations are uniform between the two).
 A maneuver ends by ``truncated`` alone.  Environment i of a vector environment reset with ``seed`` flies the same
@@ -24,7 +26,7 @@ from koz_jax import extras
 from koz_jax.errors import UserError
 from koz_jax.layout import ACTION_SIZE
 from koz_jax.task_config import TaskConfig
-from koz_jax.vector_env import Fleet, VectorStep, observation_bounds
+from koz_jax.vector_env import Fleet, VectorStep, observation_bounds, seeds_from
 
 try:
     import gymnasium
@@ -86,13 +88,14 @@ class ReorientationEnv(gymnasium.Env[Floats, Floats]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         """Begin a new random scenario: the first of the seed, or without a seed the next one."""
         _refuse(options)
-        super().reset(seed=seed)
-        if seed is None and not self._fleet.begun:
-            seed = int(self.np_random.integers(2**32))
-        if seed is None and self._next is not None:
+        seeds = None if seed is None else seeds_from(seed, 1)
+        super().reset(seed=None if seeds is None else seeds[0])
+        if seeds is None and not self._fleet.begun:
+            seeds = [int(self.np_random.integers(2**32))]
+        if seeds is None and self._next is not None:
             observed = self._next
         else:
-            observed = self._fleet.reset(None if seed is None else [seed])[0]
+            observed = self._fleet.reset(seeds)[0]
         self._next = None
         return observed, {}
 
@@ -100,7 +103,7 @@ class ReorientationEnv(gymnasium.Env[Floats, Floats]):
         """Apply an action (3,) in [-1, 1] (clipped)."""
         if self._next is not None:
             raise UserError("step: must come after a reset, got one after the end of the episode")
-        stepped = self._fleet.step(np.asarray(action)[None])
+        stepped = self._fleet.step([action])
         if stepped.truncated[0]:
             self._next = np.asarray(stepped.observation)[0]
         info = {name: values[0].item() for name, values in _info(stepped).items()}
@@ -139,18 +142,25 @@ class ReorientationVectorEnv(VectorEnv[Floats, Floats, npt.NDArray[Any]]):
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     def reset(
-        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats, dict[str, Any]]:
         """Begin new random scenarios in all environments.
 
-        seed: environment i gets ``seed + i``, or the i-th of a sequence; without one all go on to their next scenario.
+        seed: environment i gets ``seed + i``, or the i-th of a sequence, where None is drawn; without one all go on to
+        their next scenario.
         """
         _refuse(options)
-        super().reset(seed=seed if isinstance(seed, int) else None)
+        super().reset()
         if seed is None and not self._fleet.begun:
-            seed = self.np_random.integers(2**32, size=self.num_envs).tolist()
-        seeds = range(seed, seed + self.num_envs) if isinstance(seed, int) else seed
-        return self._fleet.reset(seeds), {}
+            seed = [None] * self.num_envs
+        if seed is None:
+            return self._fleet.reset(), {}
+        if not isinstance(seed, Sequence | np.ndarray):
+            seeds = seeds_from(seed, self.num_envs)
+            super().reset(seed=seeds[0])
+            return self._fleet.reset(seeds), {}
+        drawn = self.np_random.integers(2**32, size=len(seed)).tolist()
+        return self._fleet.reset([new if one is None else one for one, new in zip(seed, drawn, strict=True)]), {}
 
     def step(self, actions: Floats) -> tuple[Floats, npt.NDArray[np.float64], Bools, Bools, dict[str, Any]]:
         """Apply actions (num_envs, 3) in [-1, 1] (clipped)."""

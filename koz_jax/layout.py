@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 import numpy as np
+import numpy.typing as npt
 
 from koz_jax.errors import UserError
 
@@ -80,15 +81,37 @@ SIZE = size()
 SLICES = slices()
 
 
-def as_observations(observations: np.ndarray, zones: int = 1) -> np.ndarray:
+def as_observations(observations: npt.ArrayLike, zones: int = 1) -> np.ndarray:
     """Check what a controller that sees so many zones is asked.  Returns float32 (size,) or (batch, size).
 
     Raises:
-        UserError: they have another shape.
+        UserError: they are no finite numbers, or have another shape.
 
     """
-    observed = np.asarray(observations, np.float32)
+    observed = as_numbers("observations", observations)
     allowed = size(zones)
     if observed.ndim not in (1, 2) or observed.shape[-1] != allowed:
         raise UserError(f"observations: must have shape ({allowed},) or (batch, {allowed}), got {observed.shape}")
     return observed
+
+
+def as_numbers(name: str, given: npt.ArrayLike) -> npt.NDArray[np.float32]:
+    """Take what should be finite real numbers as float32.
+
+    Raises:
+        UserError: it is something else; the message calls it by its name.
+
+    """
+    try:
+        numbers = np.asarray(given)
+        if not np.can_cast(numbers.dtype, np.float64, "same_kind"):
+            raise TypeError(f"type {numbers.dtype}")
+        with np.errstate(over="ignore"):
+            numbers = numbers.astype(np.float32)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{name}: must be an array of real numbers, got {error}") from None
+    wrong = np.argwhere(~np.isfinite(numbers))
+    if len(wrong):
+        place = tuple(int(index) for index in wrong[0])
+        raise UserError(f"{name}: must be finite in float32, got {np.asarray(given)[place]} at {list(place)}")
+    return numbers

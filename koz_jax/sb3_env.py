@@ -9,7 +9,7 @@ Environment i seeded with ``seed`` flies the same scenarios as every other adapt
 """
 
 from collections.abc import Sequence
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,7 @@ import numpy.typing as npt
 from koz_jax import extras
 from koz_jax.errors import UserError
 from koz_jax.task_config import TaskConfig
-from koz_jax.vector_env import Fleet, VectorStep
+from koz_jax.vector_env import Fleet, VectorStep, seeds_from
 
 try:
     from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices
@@ -25,16 +25,6 @@ except ModuleNotFoundError as error:
     raise extras.missing(error, "sb3") from None
 
 from koz_jax.gym_env import single_spaces
-
-
-class _NoInfo(dict[str, Any]):
-    """The info of every environment whose episode goes on; one object for all of them, so nobody may write to it."""
-
-    def __setitem__(self, key: str, value: Any) -> NoReturn:
-        raise TypeError("infos of environments whose episode goes on are shared; copy before writing")
-
-
-_NO_INFO = _NoInfo()
 
 
 class ReorientationVecEnv(VecEnv):
@@ -70,6 +60,13 @@ class ReorientationVecEnv(VecEnv):
         self._reset_seeds()
         return observed
 
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Set the seeds of the next reset: environment i gets ``seed + i``; None draws one.  Returns them."""
+        if seed is None:
+            # From the generator that set_random_seed of Stable-Baselines3 seeds.
+            seed = int(np.random.randint(2**32 - self.num_envs + 1, dtype=np.int64))
+        return super().seed(seeds_from(seed, self.num_envs)[0])
+
     def step_async(self, actions: npt.NDArray[np.float32]) -> None:
         """Step every environment.  actions: (num_envs, 3) in [-1, 1] (clipped)."""
         self.last_step = self._fleet.step(actions)
@@ -79,7 +76,7 @@ class ReorientationVecEnv(VecEnv):
     ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.bool_], list[dict[str, Any]]]:
         """Observations, rewards, whether episodes are over, and infos of the step."""
         stepped: Any = self.last_step
-        infos: list[dict[str, Any]] = [_NO_INFO] * self.num_envs
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         success = stepped.settled & ~stepped.violated
         for i in np.flatnonzero(stepped.truncated):
             infos[i] = {

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from koz_jax.settings import NonNegativeFloat, PositiveFloat, PositiveInt, Settings, ShareBelowOne
+from koz_jax.errors import UserError
+from koz_jax.settings import HalfAngleDeg, NonNegativeFloat, PositiveFloat, PositiveInt, Settings, ShareBelowOne
 
 
 class UncertaintyConfig(Settings):
@@ -24,7 +25,7 @@ CERTAIN = UncertaintyConfig()
 class ShieldConfig(Settings):
     """The shield."""
 
-    margin_deg: PositiveFloat = 0.1
+    margin_deg: HalfAngleDeg = 0.1
     """Angle kept from every zone [deg]; more is kept where attitude noise is withstood."""
     withstands: UncertaintyConfig = CERTAIN
     """Errors for which the guarantee holds."""
@@ -32,3 +33,19 @@ class ShieldConfig(Settings):
     """Rate with which the boresight is led around a zone [deg/s]."""
     samples: PositiveInt = 12
     """Samples of a brake path: more are less cautious and slower."""
+
+    def check(self, torque_limit: float) -> None:
+        """Refuse to withstand what a spacecraft has no torque for.
+
+        torque_limit: [N m] about each body axis.
+
+        Raises:
+            UserError: the disturbance is as strong.
+
+        """
+        disturbance = self.withstands.disturbance_torque
+        if disturbance >= torque_limit:
+            raise UserError(
+                f"disturbance_torque: must be below the torque limit of {torque_limit} N m for the shield to withstand"
+                f" it, got {disturbance}"
+            )

@@ -4,7 +4,9 @@ Every adapter (brax, Gymnasium, Stable-Baselines3) draws from here, so an enviro
 one with seed s flies in its episode k the scenario of ``jax.random.fold_in(jax.random.key(s), k)``.
 """
 
+import operator
 from collections.abc import Sequence
+from typing import SupportsIndex
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +18,7 @@ from koz_jax import env, evaluation, keep_out, observation, reward, scenario, ta
 from koz_jax.env import EnvParams, EnvState
 from koz_jax.errors import UserError
 from koz_jax.evaluation import MonteCarloConfig
-from koz_jax.layout import ACTION_SIZE
+from koz_jax.layout import ACTION_SIZE, as_numbers
 from koz_jax.scenario import InfeasibleRule, ScenarioRanges
 from koz_jax.task_config import TaskConfig
 
@@ -147,8 +149,8 @@ class Fleet:
         max_angle_deg: float = 180.0,
     ) -> None:
         """Set up; ``reset`` before the first step."""
-        if not 1 <= num_envs <= MAX_ENVS:
-            raise UserError(f"num_envs: must be from 1 to {MAX_ENVS}, got {num_envs}")
+        if not isinstance(num_envs, int | np.integer) or not 1 <= num_envs <= MAX_ENVS:
+            raise UserError(f"num_envs: must be a whole number from 1 to {MAX_ENVS}, got {num_envs!r}")
         self.num_envs = num_envs
         self._maneuvers = maneuvers(task_config, min_angle_deg, max_angle_deg)
         self._state: VectorState | None = None
@@ -161,7 +163,7 @@ class Fleet:
     def reset(self, seeds: Sequence[int] | None = None) -> npt.NDArray[np.float32]:
         """Begin the first episode of every seed, or with None the next one of the seeds that are set.
 
-        seeds: one per environment, from 0 to 2^32 - 1.  Returns observations (n, entries).
+        seeds: one per environment, from 0 to 2^32 - 1 (see ``seeds_from``).  Returns observations (n, entries).
         """
         if seeds is not None:
             key, episode = _keys(seeds, self.num_envs), jnp.zeros(self.num_envs, jnp.int32)
@@ -176,11 +178,9 @@ class Fleet:
         """Step every environment.  actions: (n, 3) in [-1, 1] (clipped).  Returns NumPy leaves (n, ...)."""
         if self._state is None:
             raise UserError("step: must come after a reset, got none so far")
-        given = np.asarray(actions, np.float32)
+        given = as_numbers("actions", actions)
         if given.shape != (self.num_envs, ACTION_SIZE):
             raise UserError(f"actions: must have shape {(self.num_envs, ACTION_SIZE)}, got {given.shape}")
-        if not np.isfinite(given).all():
-            raise UserError(f"actions: must be finite, got {given[~np.isfinite(given)][0]}")
         self._state, stepped = step(self._maneuvers, self._state, given)
         # Copies, because what jax lends is read-only.
         return jax.tree.map(np.array, stepped)
@@ -190,10 +190,31 @@ def _keys(seeds: Sequence[int], num_envs: int) -> jax.Array:
     """Typed keys (n,) of the environments."""
     if len(seeds) != num_envs:
         raise UserError(f"seeds: must be one for each of {num_envs} environments, got {len(seeds)}")
-    for seed in (min(seeds), max(seeds)):
-        if not 0 <= seed < 2**32:
-            raise UserError(f"seed: must be from 0 to 2^32 - 1, got {seed}")
-    return jax.vmap(jax.random.key)(np.array(seeds, np.uint32))
+    checked = [_checked_seed(seed) for seed in seeds]
+    return jax.vmap(jax.random.key)(np.array(checked, np.uint32))
+
+
+def seeds_from(first: SupportsIndex, num_envs: int) -> range:
+    """Seeds of environments that follow one another.
+
+    Raises:
+        UserError: they do not all lie from 0 to 2^32 - 1.
+
+    """
+    start = _checked_seed(first)
+    if start + num_envs > 2**32:
+        raise UserError(f"seed: must be from 0 to 2^32 - {num_envs} for {num_envs} environments, got {first}")
+    return range(start, start + num_envs)
+
+
+def _checked_seed(seed: SupportsIndex) -> int:
+    try:
+        number = operator.index(seed)
+    except TypeError:
+        number = -1
+    if not 0 <= number < 2**32:
+        raise UserError(f"seed: must be a whole number from 0 to 2^32 - 1, got {seed!r}")
+    return number
 
 
 def observation_bounds(task_config: TaskConfig) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:

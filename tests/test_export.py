@@ -20,6 +20,7 @@ from koz_jax.config import NO_ENCODING
 from koz_jax.errors import UserError
 from koz_jax.evaluation import MonteCarloConfig
 from koz_jax.export.__main__ import export, main, write_files
+from koz_jax.export.c import _number
 from koz_jax.export.golden import Golden, golden
 from koz_jax.export.library import STRICT, CLibrary
 from koz_jax.export.loop import HostController
@@ -234,7 +235,7 @@ def test_the_hash_is_of_the_training_and_not_of_its_verdict(agent):
 
 def test_a_provenance_cannot_leave_its_comment(agent):
     record = agent.to_numpy().record.model_copy(update={"provenance": Provenance(command="*/ int x; /* \\\n?? //")})
-    policy = type(agent.to_numpy())(views=(), layers=agent.to_numpy().layers, record=record, name="a*/b\nc\\")
+    policy = type(agent.to_numpy())(views=(), layers=agent.to_numpy().layers, record=record, name="a*/b\nc*\\d\\")
     text = as_text(describe(policy))
     assert "*/" not in text and "/*" not in text and "\\" not in text
     assert all(line == "" or len(line) <= 110 for line in text.splitlines())
@@ -273,3 +274,24 @@ def test_the_library_needs_no_jax():
     code = "import sys, koz_jax.export.library; print([name for name in ('jax', 'flax') if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
+
+
+def test_what_no_export_has_written_is_not_overwritten(agent, tmp_path):
+    (tmp_path / "Makefile").write_text("all: my own\n")
+    before = tiny.contents(tmp_path)
+    with pytest.raises(UserError, match=r"out: .*Makefile was not written by an export"):
+        write_files(tmp_path, export(agent, "c"))
+    assert tiny.contents(tmp_path) == before
+
+
+def test_every_format_is_exported_anew_in_its_place(agent, tmp_path):
+    for to in ("c", "onnx", "stablehlo", "c", "onnx", "stablehlo"):
+        write_files(tmp_path, export(agent, to))
+    assert (tmp_path / "koz_policy.c").is_file() and (tmp_path / "koz_policy.onnx").is_file()
+
+
+@pytest.mark.parametrize("value", [0.1, 1e-5, -2.0, 0.016608869656920433, 3.4e38])
+def test_constants_are_the_shortest_that_read_back(value):
+    text = _number(value)
+    assert text.endswith("f") and np.float32(text[:-1]) == np.float32(value)
+    assert len(text) <= len("-1.23456789e-38f")

@@ -1,15 +1,19 @@
 """The exported shield decides as the core's does, and holds where it is the one that flies."""
 
+import re
 import shutil
+import subprocess
 
 import jax
 import numpy as np
 import pytest
 import tiny
 from flax import struct
+from pydantic import ValidationError
 
 from koz_jax import evaluation, rollout, shield, task
 from koz_jax.agent import load_agent
+from koz_jax.config import TrainConfig
 from koz_jax.controllers.base import Controller
 from koz_jax.controllers.registry import load_controller
 from koz_jax.env import EnvParams, EnvState
@@ -17,8 +21,9 @@ from koz_jax.errors import UserError
 from koz_jax.export.__main__ import export, main, write_files
 from koz_jax.export.golden import Golden, Situation, golden, situations
 from koz_jax.export.library import CLibrary
+from koz_jax.export.names import SHIELD_FILES
 from koz_jax.rollout import CaseResult
-from koz_jax.shield_config import ShieldConfig
+from koz_jax.shield_config import ShieldConfig, UncertaintyConfig
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 
@@ -132,6 +137,53 @@ def test_the_command_line_asks_for_it(tmp_path, capsys):
     ):
         assert main([*where, *flags]) == 2
         assert reason in capsys.readouterr().err
-    (tmp_path / "c" / "koz_shield.c").unlink()
+    # Without one, none of an earlier export stays to be compiled in.
+    assert main([*where, "--to", "c"]) == 0
+    assert not list((tmp_path / "c").glob("koz_shield*"))
     with pytest.raises(UserError, match="exported without"):
         CLibrary(tmp_path / "c").shield(np.zeros((1, 16)), np.zeros((1, 3)))
+
+
+@pytest.mark.parametrize("config", [CONFIG, ShieldConfig(withstands=UncertaintyConfig(inertia_error=0.05))])
+def test_its_self_test_passes_and_notices_another_margin(agent, tmp_path, config):
+    write_files(tmp_path, export(agent, "c", config))
+    done = subprocess.run(["make", "-C", tmp_path, "test"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "golden vectors of the shield: 100" in done.stdout and done.stdout.count("passed") == 2
+    source = (tmp_path / "koz_shield.c").read_text()
+    changed = re.sub(r"(shield_margin = )[^;]*;", r"\g<1>0.2f;", source)
+    assert changed != source
+    (tmp_path / "koz_shield.c").write_text(changed)
+    done = subprocess.run(["make", "-C", tmp_path, "test"], capture_output=True, text=True, check=False)
+    assert done.returncode != 0 and "FAILED" in done.stdout
+
+
+def test_a_shield_of_another_controller_is_not_compiled_in(agent, tmp_path):
+    shield_of_phase1 = {name: text for name, text in export(agent, "c", CONFIG).items() if name in SHIELD_FILES}
+    write_files(tmp_path, export(load_agent("zones3"), "c"))
+    for name, content in shield_of_phase1.items():
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(UserError, match="different exports"):
+        CLibrary(tmp_path)
+
+
+def test_rows_that_c_would_read_beyond_are_refused(library):
+    situations, torques = np.zeros((2, 16)), np.zeros((2, 3))
+    for one, other, message in (
+        (np.zeros((2, 5)), torques, r"situations: must have shape \(batch, 16\), got \(2, 5\)"),
+        (situations, np.zeros((2, 1)), r"torques: must have shape \(batch, 3\), got \(2, 1\)"),
+        (situations, np.zeros((3, 3)), "torques: must be one for each of 2 situations, got 3"),
+    ):
+        with pytest.raises(UserError, match=message):
+            library.shield(one, other)
+
+
+def test_it_cannot_withstand_what_there_is_no_torque_for(agent):
+    config = ShieldConfig(withstands=UncertaintyConfig(disturbance_torque=2.0))
+    with pytest.raises(UserError, match=r"disturbance_torque: must be below the torque limit of 2\.0 N m .*, got 2\.0"):
+        export(agent, "c", config)
+    with pytest.raises(UserError, match="disturbance_torque"):
+        evaluation.monte_carlo(agent, 1, shield=config)
+    shielding = {"enabled": True, "shield": config.model_dump()}
+    with pytest.raises(ValidationError, match="disturbance_torque"):
+        TrainConfig.model_validate(tiny.merged(tiny.CONFIG.model_dump(), {"shielding": shielding}))

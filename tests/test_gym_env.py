@@ -1,4 +1,5 @@
 import warnings
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -52,6 +53,19 @@ def test_a_sequence_of_seeds_gives_each_environment_its_own():
     first, _ = envs.reset(seed=[9, 4, 0])
     again, _ = envs.reset(seed=4)
     np.testing.assert_array_equal(first[1], again[0])
+    mixed, _ = envs.reset(seed=[None, 4, None])
+    np.testing.assert_array_equal(mixed[1], first[1])
+    assert np.all(np.abs(mixed[[0, 2]] - first[[0, 2]]).max(axis=1) > 1e-2)
+
+
+def test_seeds_may_be_numbers_of_numpy_but_no_fractions():
+    env, envs = ReorientationEnv(TASK), ReorientationVectorEnv(2, TASK)
+    numpy_seed: Any = np.int64(4)
+    fraction: Any = 1.5
+    np.testing.assert_array_equal(envs.reset(seed=numpy_seed)[0][0], env.reset(seed=4)[0])
+    for which in (env, envs):
+        with pytest.raises(UserError, match=r"seed: must be a whole number .*, got 1\.5"):
+            which.reset(seed=fraction)
 
 
 def test_a_step_after_the_end_of_an_episode_is_refused():

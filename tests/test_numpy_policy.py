@@ -47,6 +47,22 @@ def test_any_network_of_ours_acts_alike(saved):
     np.testing.assert_allclose(load_policy(saved).predict(batch[7]), actions[7], rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (np.full(16, np.nan), r"observations: must be finite in float32, got nan at \[0\]"),
+        (np.full((2, 16), 1e300), r"observations: must be finite in float32, got 1e\+300 at \[0, 0\]"),
+        (np.zeros(16, complex), "observations: must be an array of real numbers, got type complex128"),
+        (["a"] * 16, "observations: must be an array of real numbers"),
+        ([[0.0] * 16, [0.0]], "observations: must be an array of real numbers"),
+    ],
+)
+def test_what_is_no_observation_is_refused(saved, given, message):
+    for policy in (load_policy(saved), load_agent(saved)):
+        with pytest.raises(UserError, match=message):
+            policy.predict(given)
+
+
 def test_a_damaged_or_foreign_agent_is_refused(saved, tmp_path):
     with pytest.raises(UserError, match="agent: 'nowhere' is neither"):
         load_policy("nowhere")

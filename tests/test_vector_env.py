@@ -9,7 +9,7 @@ from koz_jax.dynamics import RigidBodyState
 from koz_jax.errors import UserError
 from koz_jax.keep_out import KeepOutZone
 from koz_jax.task_config import ScenarioConfig, SpacecraftConfig, TaskConfig
-from koz_jax.vector_env import Fleet, VectorState
+from koz_jax.vector_env import Fleet, VectorState, seeds_from
 
 SHORT = TaskConfig(episode_seconds=2.0)
 
@@ -132,9 +132,9 @@ def test_no_observation_leaves_its_bounds(task_config):
     assert rates.max() > 0.1 * high[observation.SLICES["omega_BN_B"]].max()
 
 
-@pytest.mark.parametrize("num_envs", [0, -1, 2**20 + 1])
+@pytest.mark.parametrize("num_envs", [0, -1, 2**20 + 1, 2.0, "2"])
 def test_a_number_of_environments_that_cannot_be_is_refused(num_envs):
-    with pytest.raises(UserError, match=f"num_envs: must be from 1 to .*, got {num_envs}"):
+    with pytest.raises(UserError, match=f"num_envs: must be a whole number from 1 to .*, got {num_envs!r}"):
         Fleet(num_envs)
 
 
@@ -142,8 +142,10 @@ def test_a_number_of_environments_that_cannot_be_is_refused(num_envs):
     ("seeds", "message"),
     [
         ([1], "seeds: must be one for each of 2 environments, got 1"),
-        ([1, -1], "seed: must be from 0 to .*, got -1"),
-        ([2**32, 1], "seed: must be from 0 to .*, got 4294967296"),
+        ([1, -1], "seed: must be a whole number from 0 to .*, got -1"),
+        ([2**32, 1], "seed: must be a whole number from 0 to .*, got 4294967296"),
+        ([1.5, 2], "seed: must be a whole number from 0 to .*, got 1.5"),
+        (["1", 2], "seed: must be a whole number from 0 to .*, got '1'"),
         (None, "seeds: must be given at the first reset"),
     ],
 )
@@ -152,13 +154,25 @@ def test_seeds_that_cannot_be_are_refused(seeds, message):
         Fleet(2).reset(seeds)
 
 
+def test_seeds_follow_one_another():
+    assert list(seeds_from(np.int64(3), 2)) == [3, 4]
+    assert list(seeds_from(2**32 - 2, 2)) == [2**32 - 2, 2**32 - 1]
+    with pytest.raises(UserError, match=r"seed: must be from 0 to 2\^32 - 2 for 2 environments, got 4294967295"):
+        seeds_from(2**32 - 1, 2)
+    with pytest.raises(UserError, match=r"seed: must be a whole number .*, got 1\.5"):
+        seeds_from(1.5, 2)  # pyright: ignore[reportArgumentType]
+
+
 @pytest.mark.parametrize(
     ("actions", "message"),
     [
         (np.zeros(3), r"actions: must have shape \(2, 3\), got \(3,\)"),
         (np.zeros((3, 2)), r"actions: must have shape \(2, 3\), got \(3, 2\)"),
-        (np.array([[0, 0, 0], [0, np.nan, 0]]), "actions: must be finite, got nan"),
-        (np.array([[0, 0, 0], [0, -np.inf, 0]]), "actions: must be finite, got -inf"),
+        (np.array([[0, 0, 0], [0, np.nan, 0]]), r"actions: must be finite in float32, got nan at \[1, 1\]"),
+        (np.array([[0, 0, 0], [0, -np.inf, 0]]), r"actions: must be finite in float32, got -inf at \[1, 1\]"),
+        ([["a", 0, 0], [0, 0, 0]], "actions: must be an array of real numbers"),
+        ([[0, 0, 0], [0, 0]], "actions: must be an array of real numbers"),
+        (np.zeros((2, 3), complex), "actions: must be an array of real numbers, got type complex128"),
     ],
 )
 def test_actions_that_cannot_be_are_refused(actions, message):

@@ -12,6 +12,7 @@ import tyro
 
 from koz_jax import storage
 from koz_jax.errors import UserError, exit_status
+from koz_jax.export.names import C_FILES, SHIELD_FILES
 from koz_jax.shield_config import ShieldConfig
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ class ExportArgs:
     to: Literal["c", "onnx", "stablehlo"]
     """c: C99 with a self-test; onnx: a graph for onnxruntime; stablehlo: a program for XLA and jax.export."""
     out: Path
-    """Folder to write into; older files of an export are replaced."""
+    """Folder to write into; the files of an earlier export to the same format are replaced."""
     shield: bool = False
     """Also write the shield, which keeps the boresight out of every zone; for --to c."""
     shield_margin_deg: float = ShieldConfig().margin_deg
@@ -63,7 +64,7 @@ def export(agent: Agent, to: Literal["c", "onnx", "stablehlo"], shield: ShieldCo
     shield: of C only; None leaves it out.
 
     Raises:
-        UserError: a package that the format needs is not installed.
+        UserError: a package that the format needs is not installed, or the shield cannot be.
 
     """
     if to == "onnx":
@@ -75,14 +76,28 @@ def export(agent: Agent, to: Literal["c", "onnx", "stablehlo"], shield: ShieldCo
 
         return stablehlo_files(agent)
     from koz_jax.export.c import c_files, shield_files
-    from koz_jax.export.golden import golden
+    from koz_jax.export.golden import golden, shield_golden
 
     files = c_files(agent.to_numpy(), golden(agent, GOLDEN_VECTORS))
-    return files if shield is None else files | shield_files(agent.to_numpy(), shield)
+    if shield is None:
+        return files
+    return files | shield_files(agent.to_numpy(), shield, shield_golden(agent, shield, GOLDEN_VECTORS))
 
 
 def write_files(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
-    """Write files, each in one step.  Returns their paths."""
+    """Write the files of an export, each in one step, in place of those of an earlier one.  Returns their paths.
+
+    Raises:
+        UserError: a file is there that no export has written; nothing was changed.
+
+    """
+    # The shield of another controller would be compiled in.
+    superseded = {*SHIELD_FILES} - {*files} if {*C_FILES} <= {*files} else set()
+    for name in (*files, *superseded):
+        if (folder / name).exists() and b"koz_jax" not in (folder / name).read_bytes():
+            raise UserError(f"out: {folder / name} was not written by an export; choose another folder")
+    for name in superseded:
+        (folder / name).unlink(missing_ok=True)
     for name, content in files.items():
         storage.write_bytes(folder / name, content)
     return [folder / name for name in files]

@@ -6,8 +6,9 @@ from collections.abc import Iterable
 import numpy as np
 
 from koz_jax import dynamics, shield, task
-from koz_jax.export.golden import Golden
+from koz_jax.export.golden import Golden, ShieldGolden
 from koz_jax.export.metadata import Metadata, as_text, describe
+from koz_jax.export.names import C_FILES, SHIELD_FILES
 from koz_jax.layout import ACTION_SIZE, size
 from koz_jax.numpy_policy import NumpyPolicy, told_zones
 from koz_jax.shield_config import ShieldConfig
@@ -15,24 +16,24 @@ from koz_jax.shield_config import ShieldConfig
 # 1e-5 of the action's range, which is 2.
 _ACTION_TOLERANCE = "2e-5"
 _OBSERVATION_TOLERANCE = "2e-5"
-_TEMPLATES = ("koz_math.h", "koz_policy.h", "koz_policy.c", "koz_selftest.c", "Makefile")
-_SHIELD_TEMPLATES = ("koz_shield.h", "koz_shield.c")
+_TORQUE_TOLERANCE = "1e-3"
 
 
 def c_files(policy: NumpyPolicy, vectors: Golden) -> dict[str, bytes]:
     """Headers, source, self-test with golden vectors, and Makefile, by file name."""
     metadata = describe(policy)
     network = metadata.network
-    zones = told_zones(network, metadata.task.scenario)
     replacements = {
         "HEAD": _head(metadata),
         "OBSERVATION_SIZE": str(size(network.observed_zones)),
-        "ZONES": str(zones),
+        "ZONES": str(told_zones(network, metadata.task.scenario)),
         "OBSERVED_ZONES": str(network.observed_zones),
         "ACTION_SIZE": str(ACTION_SIZE),
         "TORQUE_LIMIT": _number(metadata.torque_limit),
         "STEP_SECONDS": _number(metadata.step_seconds),
+        "CONFIG_SHA256": metadata.provenance.config_sha256 or "unknown",
         "TRAINING_SHA256": metadata.training_sha256,
+        "EXPORT_ID": _export_id(metadata),
         "WEIGHTS_SHA256": metadata.weights_sha256,
         "BORESIGHT": _row(metadata.boresight_B),
         "WEIGHTS": "\n\n".join(_weights(policy)),
@@ -41,15 +42,15 @@ def c_files(policy: NumpyPolicy, vectors: Golden) -> dict[str, bytes]:
         "COUNT": str(len(vectors.action)),
         "ACTION_TOLERANCE": _ACTION_TOLERANCE,
         "OBSERVATION_TOLERANCE": _OBSERVATION_TOLERANCE,
-        "SITUATIONS": ",\n".join(_situation(row, zones) for row in vectors.situation),
+        "SITUATIONS": _situations(vectors.situation, policy),
         "OBSERVATIONS": _rows(vectors.observation),
         "ACTIONS": _rows(vectors.action),
     }
-    return {name: _fill(name, replacements).encode() for name in _TEMPLATES}
+    return {name: _fill(name, replacements).encode() for name in C_FILES}
 
 
-def shield_files(policy: NumpyPolicy, config: ShieldConfig) -> dict[str, bytes]:
-    """Header and source of a shield for the spacecraft of a policy, by file name."""
+def shield_files(policy: NumpyPolicy, config: ShieldConfig, vectors: ShieldGolden) -> dict[str, bytes]:
+    """Header, source and self-test of a shield for the spacecraft of a policy, by file name."""
     metadata = describe(policy)
     params = task.env_params(metadata.task)
     made = shield.for_spacecraft(config, params.spacecraft, params.dt)
@@ -69,12 +70,26 @@ def shield_files(policy: NumpyPolicy, config: ShieldConfig) -> dict[str, bytes]:
     }
     replacements = {
         "HEAD": _head(metadata),
+        "EXPORT_ID": _export_id(metadata),
         "MARGIN_DEG": f"{np.rad2deg(made.margin):.4g}",
+        "GUIDE_RATE_DEG": f"{config.guide_rate_deg:g}",
+        **{name.upper(): f"{error:g}" for name, error in config.withstands.model_dump().items()},
         "SAMPLES": str(made.samples),
+        "COUNT": str(len(vectors.allowed)),
+        "TOLERANCE": _TORQUE_TOLERANCE,
+        "SITUATIONS": _situations(vectors.situation, policy),
+        "REQUESTED": _rows(vectors.requested),
+        "ALLOWED": _rows(vectors.allowed),
+        "SAFE": ", ".join(str(int(safe)) for safe in vectors.safe),
         **{name: ", ".join(_braced(row) for row in np.asarray(matrix)) for name, matrix in matrices.items()},
         **{name: _number(float(value)) for name, value in numbers.items()},
     }
-    return {name: _fill(name, replacements).encode() for name in _SHIELD_TEMPLATES}
+    return {name: _fill(name, replacements).encode() for name in SHIELD_FILES}
+
+
+def _export_id(metadata: Metadata) -> str:
+    """A number that files of one controller share, for the preprocessor."""
+    return f"0x{metadata.training_sha256[:8]}"
 
 
 def _head(metadata: Metadata) -> str:
@@ -90,7 +105,7 @@ def _fill(name: str, replacements: dict[str, str]) -> str:
 
 def _number(value: float) -> str:
     """The shortest float32 constant that reads back as the same bits."""
-    return f"{np.float32(value)}f"
+    return f"{np.float32(value)!s}f"  # without !s it would have the digits of a float64
 
 
 def _row(values: Iterable[float]) -> str:
@@ -99,6 +114,11 @@ def _row(values: Iterable[float]) -> str:
 
 def _rows(table: np.ndarray) -> str:
     return ",\n".join(f"    {_braced(row)}" for row in table)
+
+
+def _situations(rows: np.ndarray, policy: NumpyPolicy) -> str:
+    zones = told_zones(policy.record.network, policy.record.task.scenario)
+    return ",\n".join(_situation(row, zones) for row in rows)
 
 
 def _situation(row: np.ndarray, zones: int) -> str:

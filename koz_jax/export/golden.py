@@ -8,16 +8,21 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from koz_jax import env, observation, rotations, task
+from koz_jax import env, observation, rotations, shield, task
 from koz_jax.agent import Agent
 from koz_jax.dynamics import RigidBodyState
 from koz_jax.env import EnvParams, EnvState
 from koz_jax.keep_out import NO_ZONE_HALF_ANGLE, KeepOutZone
 from koz_jax.numpy_policy import told_zones
 from koz_jax.scenario import Scenario
+from koz_jax.shield import Shield
+from koz_jax.shield_config import ShieldConfig
 
 _SMALLEST_ANGLE_DEG, _LARGEST_RATE = 1e-3, 0.2  # [deg], [rad/s]
 _ABSENT = 0.25  # share of zones after the first
+_DRAWN_PER_VECTOR = 20  # few requests are refused
+_MARGIN_SHIFT = 2e-4  # [rad], far above what is rounded
+_STEADY = 1e-2  # of the torque limit: another candidate is farther away
 
 
 class Situation(struct.PyTreeNode):
@@ -45,12 +50,59 @@ class Golden(NamedTuple):
     action: np.ndarray  # (count, 3)
 
 
+class ShieldGolden(NamedTuple):
+    """Situations and what the shield makes of them, none close to a threshold; leading axis (count,)."""
+
+    situation: np.ndarray  # (count, 12 + 4 zones) float32
+    requested: np.ndarray  # (count, 3) float32 [N m]
+    allowed: np.ndarray  # (count, 3) float32 [N m]
+    safe: np.ndarray  # (count,) bool, whether the situation itself is safe
+
+
 def golden(agent: Agent, count: int, seed: int = 0) -> Golden:
     """Draw situations and answer them."""
     drawn = situations(agent, count, seed)
     observed = np.asarray(_observe(drawn, task.env_params(agent.task), agent.controller.network.observed_zones))
-    rows = [np.reshape(leaf, (count, -1)) for leaf in jax.tree.leaves(drawn)]
-    return Golden(np.concatenate(rows, axis=1), observed, agent.predict(observed))
+    return Golden(_side_by_side(drawn), observed, agent.predict(observed))
+
+
+def shield_golden(agent: Agent, config: ShieldConfig, count: int, seed: int = 0) -> ShieldGolden:
+    """Draw situations and requests; of those that the shield passes and of those that it does not, half the count each.
+
+    Where other roundings could decide otherwise, as they do with a margin a little larger or smaller, none is kept.
+    """
+    params = task.env_params(agent.task)
+    config.check(agent.task.spacecraft.torque_limit)
+    made = shield.for_spacecraft(config, params.spacecraft, params.dt)
+    drawn = situations(agent, _DRAWN_PER_VECTOR * count, seed)
+    limit = params.spacecraft.torque_limit
+    box = np.random.default_rng(seed).uniform(-limit, limit, (_DRAWN_PER_VECTOR * count, 3))
+    requested = box.astype(np.float32)
+    answers = [
+        _answer(made.replace(margin=made.margin + shift), drawn, requested, params)
+        for shift in (0.0, _MARGIN_SHIFT, -_MARGIN_SHIFT)
+    ]
+    allowed, safe = (np.stack(answer) for answer in zip(*answers, strict=True))
+    steady = np.all(np.ptp(allowed, axis=0) < _STEADY * limit, axis=1) & (safe[0] == safe).all(axis=0)
+    passed = np.all(allowed[0] == requested, axis=1)
+    kept = np.concatenate([np.flatnonzero(steady & which)[: count // 2] for which in (passed, ~passed)])
+    return ShieldGolden(_side_by_side(drawn)[kept], requested[kept], allowed[0][kept], safe[0][kept])
+
+
+@jax.jit
+def _answer(made: Shield, drawn: Situation, requested: jax.Array, params: EnvParams) -> tuple[jax.Array, jax.Array]:
+    def one(situation: Situation, torque_B: jax.Array) -> tuple[jax.Array, jax.Array]:
+        state = situation.state()
+        zones = state.scenario.zones
+        allowed_B = made.filter(state.body, torque_B, zones, params)
+        return allowed_B, shield.is_safe(made, state.body, zones, params, made.margin)
+
+    return jax.vmap(one)(drawn, requested)
+
+
+def _side_by_side(drawn: Situation) -> np.ndarray:
+    """Fields as columns (count, 12 + 4 zones)."""
+    return np.concatenate([np.reshape(leaf, (len(leaf), -1)) for leaf in jax.tree.leaves(drawn)], axis=1)
 
 
 def situations(agent: Agent, count: int, seed: int = 0) -> Situation:

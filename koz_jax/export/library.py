@@ -68,13 +68,15 @@ class CLibrary:
         """Torques (batch, 3) [N m] that the shield allows in place of the requested ones.
 
         Raises:
-            UserError: it was exported without a shield.
+            UserError: it was exported without a shield, or an input has another shape.
 
         """
         if not self.has_shield:
             raise UserError("shield: this controller was exported without; --shield exports it")
-        told = np.ascontiguousarray(situations, np.float32)
-        requested = np.ascontiguousarray(torques, np.float32)
+        told = _rows_of("situations", situations, 12 + 4 * self.zones)
+        requested = _rows_of("torques", torques, ACTION_SIZE)
+        if len(told) != len(requested):
+            raise UserError(f"torques: must be one for each of {len(told)} situations, got {len(requested)}")
         allowed = np.empty_like(requested)
         for row, torque, into in zip(told, requested, allowed, strict=True):
             self._functions.koz_shield(row.ctypes.data, torque.ctypes.data, into.ctypes.data)
@@ -82,12 +84,18 @@ class CLibrary:
 
     def _rows(self, name: str, inputs: np.ndarray, entries: int, size: int) -> np.ndarray:
         function = getattr(self._functions, name)
-        rows = np.ascontiguousarray(inputs, np.float32)
-        if rows.ndim != 2 or rows.shape[1] != entries:
-            raise UserError(f"{name}: its input must have shape (batch, {entries}), got {rows.shape}")
+        rows = _rows_of(name, inputs, entries)
         outputs = np.empty((len(rows), size), np.float32)
         # Addresses of rows, because making a view of each would take longer than the controller does.
         source, target = rows.ctypes.data, outputs.ctypes.data
         for index in range(len(rows)):
             function(source + index * rows.strides[0], target + index * outputs.strides[0])
         return outputs
+
+
+def _rows_of(name: str, given: np.ndarray, entries: int) -> np.ndarray:
+    """Rows as C reads them; one that is too short would be read beyond its end."""
+    rows = np.ascontiguousarray(given, np.float32)
+    if rows.ndim != 2 or rows.shape[1] != entries:
+        raise UserError(f"{name}: must have shape (batch, {entries}), got {rows.shape}")
+    return rows

@@ -89,8 +89,7 @@ def as_text(metadata: Metadata) -> str:
         f"Limits: torque {metadata.torque_limit:g} N m about each body axis; time step {metadata.step_seconds:g} s;"
         f" boresight {list(metadata.boresight_B)} in body axes; inertia {[list(r) for r in task.spacecraft.inertia]}"
         f" kg m^2; trained for {_count(task.scenario)} of {task.scenario.min_half_angle_deg:g} to"
-        f" {task.scenario.max_half_angle_deg:g} deg half angle and maneuvers that start at rest"
-        f" ({task.scenario.max_rate_deg:g} deg/s).",
+        f" {task.scenario.max_half_angle_deg:g} deg half angle and maneuvers that start {_start(task.scenario)}.",
         "",
         f"Trained by: {origin.command or 'unknown'} (commit {origin.commit or 'unknown'}, seed {origin.seed}).",
         f"Hash of the training run's config.json: {origin.config_sha256 or 'unknown'}",
@@ -98,13 +97,19 @@ def as_text(metadata: Metadata) -> str:
         f"Hash of the weights: {metadata.weights_sha256}",
     ]
     wrapped = (piece for line in lines for piece in textwrap.wrap(line, 110, subsequent_indent="    ") or [""])
-    return "\n".join(wrapped).replace("*/", "* /").replace("/*", "/ *").replace("\\", "/")
+    return "\n".join(wrapped).replace("\\", "/").replace("*/", "* /").replace("/*", "/ *")
 
 
 def _count(scenario: ScenarioConfig) -> str:
     if scenario.max_zones == 1:
         return "one zone"
     return f"{scenario.min_zones} to {scenario.max_zones} zones"
+
+
+def _start(scenario: ScenarioConfig) -> str:
+    if scenario.max_rate_deg == 0:
+        return "at rest"
+    return f"at up to {scenario.max_rate_deg:g} deg/s about each axis"
 
 
 def _entry_text(entry: Entry) -> str:

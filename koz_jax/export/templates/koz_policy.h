@@ -10,8 +10,10 @@
 #define KOZ_ACTION_SIZE @ACTION_SIZE@
 #define KOZ_TORQUE_LIMIT @TORQUE_LIMIT@ /* [N m] about each body axis */
 #define KOZ_STEP_SECONDS @STEP_SECONDS@ /* [s] between decisions; the torque is held in between */
-#define KOZ_TRAINING_SHA256 "@TRAINING_SHA256@"
+#define KOZ_CONFIG_SHA256 "@CONFIG_SHA256@" /* config.json of the training run */
+#define KOZ_TRAINING_SHA256 "@TRAINING_SHA256@" /* network, task and origin */
 #define KOZ_WEIGHTS_SHA256 "@WEIGHTS_SHA256@"
+#define KOZ_EXPORT_ID @EXPORT_ID@
 
 /* What the controller must be told.  All numbers must be finite, quaternions and axes of unit length. */
 typedef struct {

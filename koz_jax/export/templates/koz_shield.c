@@ -7,6 +7,10 @@
 
 #include "koz_math.h"
 
+#if KOZ_EXPORT_ID != @EXPORT_ID@
+#error "this shield and koz_policy.h are of different exports"
+#endif
+
 #define SAMPLES @SAMPLES@
 #define CANDIDATES 3 /* before the brake, which is what is left when all are refused */
 
@@ -140,7 +144,7 @@ static int clear(const koz_situation *now, const coast *at, float bulge, float t
         const float cosine = cosf(half_angle);
         const float shrunk = cosine > 0.0f ? cosine * (1.0f - 0.5f * tolerance * tolerance) : cosine;
         const float found = koz_dot(koz_boresight_B, at->v[1 + zone]) + bulge;
-        if (half_angle > 0.0f && !(found <= shrunk - sinf(half_angle) * tolerance)) return 0;
+        if (!(half_angle <= 0.0f) && !(found <= shrunk - sinf(half_angle) * tolerance)) return 0;
     }
     return 1;
 }
@@ -191,7 +195,7 @@ static int step_is_clear(const koz_situation *now, const body_state *before, con
         const float *axis_N = now->zone_axis_N[zone];
         const float highest = larger(koz_dot(axis_N, start_N), koz_dot(axis_N, end_N));
         const float half_angle = now->zone_half_angle[zone];
-        if (half_angle > 0.0f && !(highest + bulge <= cosf(half_angle))) return 0;
+        if (!(half_angle <= 0.0f) && !(highest + bulge <= cosf(half_angle))) return 0;
     }
     return 1;
 }

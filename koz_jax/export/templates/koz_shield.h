@@ -1,6 +1,11 @@
 /*
  * Shield: lets a torque through only if the spacecraft can still come to rest outside all zones afterwards.
- * Keeps @MARGIN_DEG@ deg from every zone.
+ * Keeps @MARGIN_DEG@ deg from every zone.  Made for errors of up to
+ *     @INERTIA_ERROR@ of the inertia about any axis,
+ *     @DISTURBANCE_TORQUE@ N m of constant torque from outside,
+ *     @ATTITUDE_NOISE_DEG@ deg per axis in the measured attitude (standard deviation, cut at three times that),
+ *     @RATE_NOISE_DEG@ deg/s per axis in the measured rate (likewise).
+ * Leads around a zone at @GUIDE_RATE_DEG@ deg/s, and looks at @SAMPLES@ points of a brake path.
  *
 @HEAD@
  */
@@ -11,7 +16,8 @@
 
 /*
  * The torque [N m] to apply for KOZ_STEP_SECONDS in place of the requested one, of koz_torque or of anything else.
- * Uses attitude, rate and zones of the situation.  The guarantee holds from states that koz_is_safe accepts on.
+ * Uses attitude, rate and zones of the situation.  From states on that koz_is_safe accepts, the boresight stays out of
+ * every zone, as long as errors are no larger than those above and the torque allowed here is the one applied.
  */
 void koz_shield(const koz_situation *now, const float requested_B[3], float allowed_B[3]);
 
