@@ -47,21 +47,31 @@ def main(argv: list[str]) -> int:
 
 def _evaluate(args: EvalArgs) -> int:
     # jax is imported only now: --help and flags that do not exist are answered at once.
-    from koz_jax import evaluation, runtime
+    from koz_jax import processes, runtime
 
     config = args.config(args.substeps)
     args.check()
+    if args.replay_case is not None and args.coordinator is not None:
+        raise UserError(f"replay_case: is flown by one process, got {args.replay_case} with --coordinator")
     runtime.configure()
     args.join()
-    pilot = args.pilot()
-    task = args.task(pilot)
-    evaluation.check_feasible(task, config.max_angle_deg)
-    _check_outputs(args)  # last, since it makes a folder
+    pilot, task = processes.together(lambda: _prepare(args, config))
     if args.replay_case is not None:
         _replay(pilot, task, config, args.replay_case, _history_path(args))
     else:
         _monte_carlo(pilot, task, config, args)
     return 0
+
+
+def _prepare(args: EvalArgs, config: MonteCarloConfig) -> tuple[Pilot, TaskConfig]:
+    """Load who flies, and refuse what cannot be flown or written."""
+    from koz_jax import evaluation
+
+    pilot = args.pilot()
+    task = args.task(pilot)
+    evaluation.check_feasible(task, config.max_angle_deg)
+    _check_outputs(args)  # last, since it makes a folder
+    return pilot, task
 
 
 def _history_path(args: EvalArgs) -> Path:

@@ -81,28 +81,33 @@ def _train(config: TrainConfig, args: RunArgs) -> int:
 
     run = args.resume or args.run or Path("runs", time.strftime(f"{config.preset}-seed{config.seed}-%Y%m%d-%H%M%S"))
     if args.seeds > 1 or (args.resume is not None and os.path.isfile(run / "seeds.json")):
+        for name in ("devices", "processes"):
+            if getattr(args, name) > 1:
+                raise UserError(f"{name}: must be 1 for several seeds, as in {run}; got {getattr(args, name)}")
         return _train_seeds(config, args, run)
     runtime.configure()
     args.join()
     if args.resume:
-        config = RunFolder(run).read_config()
+        config = processes.together(RunFolder(run).read_config)
     agent = train(config, run, resume=args.resume is not None, start_from=args.start_from, devices=args.devices)
     # The others wait for the first, which reports.
-    return processes.together(lambda: 0 if args.process > 0 else _report(agent, args.cases, run))
+    return processes.together(lambda: 0 if args.process > 0 else _report(agent, config, args.cases, run))
 
 
-def _report(agent: Agent | None, cases: int, run: Path) -> int:
+def _report(agent: Agent | None, config: TrainConfig, cases: int, run: Path) -> int:
     from koz_jax import evaluation, storage
     from koz_jax.run_folder import RunFolder
     from koz_jax.summary import summarise, table
 
     if agent is None:
         return _stopped(run)
-    flown = evaluation.monte_carlo(agent, cases)
+    shield = config.shielding.in_force
+    flown = evaluation.monte_carlo(agent, cases, shield=shield)
     summary = summarise(flown.results)
     storage.write_json(RunFolder(run).evaluation, evaluation.report(flown, summary))
-    print(table(summary, cases, run.resolve().name))
-    print(f"\nlook further: python eval_mc.py --agent {shlex.quote(str(run))} --csv cases.csv")
+    print(table(summary, cases, run.resolve().name + (" + shield" if shield else ""), shield is not None))
+    flags = f"--shield --shield-margin-deg {shield.margin_deg:g} " if shield else ""
+    print(f"\nlook further: python eval_mc.py --agent {shlex.quote(str(run))} {flags}--csv cases.csv")
     return 0
 
 

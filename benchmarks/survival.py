@@ -144,6 +144,48 @@ def full_disk(reference: RunFolder, cache: Path, work: Path) -> tuple[str, bool]
         subprocess.run(["umount", disk], check=False)
 
 
+def filled_disk(reference: RunFolder, cache: Path, work: Path) -> tuple[str, bool]:
+    """Fill the disk with another file while a run trains on it; then make room and go on."""
+    disk = work / "filled"
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64m", "tmpfs", disk], check=False).returncode:
+        return "not measured: no disk can be mounted here", True
+    try:
+        folder = RunFolder(disk / "run")
+        log = folder.path / "metrics.csv"
+        with subprocess.Popen(
+            train_command("--run", folder.path, *FLAGS), env=environment(cache), stderr=subprocess.PIPE, text=True
+        ) as process:
+            while process.poll() is None and not log.exists():
+                time.sleep(0.002)
+            fill(disk / "other")
+            try:
+                errors = process.communicate(timeout=_RUN_S)[1]
+            except subprocess.TimeoutExpired:
+                process.kill()
+                return f"hangs: {process.communicate()[1][-400:]}", False
+        lines = [line for line in errors.splitlines() if line.startswith("error: ")]
+        clear = process.returncode == 2 and "Traceback" not in errors and len(lines) == 1
+        (disk / "other").unlink()
+        resumed = run(train_command("--resume", folder.path), cache)
+        different = differences(folder, reference) if resumed.returncode == 0 else [resumed.stderr[-300:]]
+        text = f"filled by another: {lines or errors[-400:]}; with room again resumed, {len(different)} files differ"
+        return text, clear and not different
+    finally:
+        subprocess.run(["umount", disk], check=False)
+
+
+def fill(path: Path) -> None:
+    """Write a file until the disk is full."""
+    with open(path, "wb", buffering=0) as file:
+        for size in (2**20, 2**12, 1):
+            try:
+                while True:
+                    file.write(bytes(size))
+            except OSError:
+                continue
+
+
 def remount(disk: Path, options: str) -> None:
     subprocess.run(["mount", "-o", f"remount,{options}", disk], check=True)
 
@@ -192,6 +234,7 @@ def main(argv: list[str]) -> int:
         jobs: dict[str, Callable[[], tuple[str, bool]]] = {
             "kills": lambda: kills(args.kills, reference, cache, work),
             "full and read-only disk": lambda: full_disk(reference, cache, work),
+            "disk filled by another": lambda: filled_disk(reference, cache, work),
             "corruptions": lambda: corruption.corruptions(args.corruptions, reference, CONFIG, work),
             "no numbers": lambda: faults.faults(CONFIG, work),
             "bad settings": lambda: bad_lines(args.bad, cache, work),

@@ -36,7 +36,6 @@ class _Flown:
     results: CaseResult  # NumPy leaves (cases,)
     compile_s: float
     wall_s: float
-    kept: bool  # whether it was on disk already
 
 
 def run_cases(
@@ -67,6 +66,8 @@ def run_cases(
     count = jax.process_count()
     if count > 1 and partial is None:
         raise UserError(f"partial: {count} processes need a folder that all of them see, got none")
+    identity = {} if partial is None else _identity(pilot, task_config, config)
+    processes.require_same("what is flown", (identity, config.first, config.cases, block))
     parts = _parts(config, block)
     mine = parts[jax.process_index() :: count]
     with ExitStack() as stack:
@@ -78,23 +79,20 @@ def run_cases(
 
         def fly_mine() -> list[_Flown]:
             found = []
-            for done in _fly(pilot, task_config, mine, partial):
+            for done in _fly(pilot, task_config, mine, partial, identity):
                 found.append(done)
                 bar.update(len(done.results.settled))
             return found
 
+        start = time.perf_counter()
         flown = processes.together(fly_mine)
+        compile_s = sum(done.compile_s for done in flown)
+        wall_s = sum(done.wall_s for done in flown)
         if count > 1:
-            flown = list(_fly(pilot, task_config, parts, partial))  # all are there to be read
+            wall_s = time.perf_counter() - start - compile_s  # of the slowest
+            flown = list(_fly(pilot, task_config, parts, partial, identity))  # all are there to be read
     results = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(done.results for done in flown))
-    fresh = [done for done in flown if not done.kept]
-    return MonteCarlo(
-        pilot.name,
-        config,
-        results,
-        compile_s=sum(done.compile_s for done in fresh),
-        wall_s=sum(done.wall_s for done in flown),
-    )
+    return MonteCarlo(pilot.name, config, results, compile_s, wall_s)
 
 
 def _open(partial: Path, stack: ExitStack) -> None:
@@ -112,9 +110,12 @@ def _parts(config: MonteCarloConfig, block: int) -> list[MonteCarloConfig]:
 
 
 def _fly(
-    pilot: Pilot, task_config: TaskConfig, parts: list[MonteCarloConfig], partial: Path | None
+    pilot: Pilot,
+    task_config: TaskConfig,
+    parts: list[MonteCarloConfig],
+    partial: Path | None,
+    identity: dict[str, Any],
 ) -> Iterator[_Flown]:
-    identity = {} if partial is None else _identity(pilot, task_config, parts[0])
     compiled = False
     for part in parts:
         folder = None if partial is None else partial / f"block-{part.first:010d}"
@@ -132,10 +133,10 @@ def _fly_block(pilot: Pilot, task_config: TaskConfig, part: MonteCarloConfig, *,
     """Fly one block; the first one is compiled, and timed apart from that."""
     if not compiled:
         first = evaluation.run_cases(pilot, task_config, part)
-        return _Flown(first.results, first.compile_s, first.wall_s, kept=False)
+        return _Flown(first.results, first.compile_s, first.wall_s)
     start = time.perf_counter()
     results = evaluation.fly_cases(pilot.controller, task_config, part)
-    return _Flown(results, 0.0, time.perf_counter() - start, kept=False)
+    return _Flown(results, 0.0, time.perf_counter() - start)
 
 
 def _read(
@@ -150,7 +151,7 @@ def _read(
         if record.get("cases") == part.cases and saved == identity:
             shapes = evaluation.result_shapes(pilot.controller, task_config, part)
             results = jax.tree.map(np.asarray, storage.load_tree(folder, shapes))
-            return _Flown(results, 0.0, float(record["wall_s"]), kept=True)
+            return _Flown(results, 0.0, float(record["wall_s"]))
     except UserError as damage:
         warn(f"{damage}; these cases are flown again")
         return None

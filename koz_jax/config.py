@@ -198,6 +198,11 @@ class ShieldingConfig(Settings):
     shield: ShieldConfig = ShieldConfig()
     """The shield."""
 
+    @property
+    def in_force(self) -> ShieldConfig | None:
+        """The shield that the agent flies under, if it does."""
+        return self.shield if self.enabled else None
+
 
 class TrainConfig(Settings):
     """One training run."""
@@ -288,8 +293,8 @@ class TrainConfig(Settings):
 
     @model_validator(mode="after")
     def _can_be_shielded(self) -> Self:
-        if self.shielding.enabled:
-            self.shielding.shield.check(self.task.spacecraft.torque_limit)
+        if self.shielding.in_force:
+            self.shielding.in_force.check(self.task.spacecraft.torque_limit)
         return self
 
     def to_json(self) -> str:

@@ -11,6 +11,8 @@ from pydantic import ValidationError
 class UserError(ValueError):
     """Something the user gave cannot be used; the message names it, its value, and what is allowed."""
 
+    agreed = False  # whether all of several processes end with it (see ``processes.raise_together``)
+
 
 def warn(text: str) -> None:
     """Say on stderr what went wrong without ending the work."""
@@ -36,11 +38,26 @@ def exit_status(command: Callable[[], int]) -> int:
     except (ValidationError, UserError) as error:
         message = explain(error) if isinstance(error, ValidationError) else str(error)
         print("\n".join(f"error: {line}" for line in message.splitlines()), file=sys.stderr)
-        return 2
+        if isinstance(error, UserError) and error.agreed:
+            return 2
+        return _alone(2)
     except BrokenPipeError:
         # The reader of the output has left (``train.py --help | head``); nor may Python's last flush complain.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 141
+        return _alone(141)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
-        return 130
+        return _alone(130)
+
+
+def _alone(status: int) -> int:
+    """Return a status that this process ends with alone; if it is one of several (``runtime.join``), end at once.
+
+    The others may be waiting for it, and at the end of Python it would wait for them.
+    """
+    jax = sys.modules.get("jax")
+    if jax is not None and jax.distributed.is_initialized():
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    return status

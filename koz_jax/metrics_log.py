@@ -2,12 +2,15 @@
 
 import csv
 import math
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
-from tensorboardX import SummaryWriter
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]
+from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
 
 from koz_jax import storage
 from koz_jax.errors import UserError
@@ -42,7 +45,7 @@ class MetricsLog:
                 storage.write_text(self._path, text)
             else:
                 self._path.unlink(missing_ok=True)
-            self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=resume_at + 1)
+            self._board = _Board(folder / "tensorboard", resume_at + 1)
         except OSError as error:
             raise UserError(f"{folder}: cannot be written: {error.strerror or error}") from None
 
@@ -71,13 +74,46 @@ class MetricsLog:
         if not self._timing.exists():
             _append(self._timing, ["updates", *times])
         _append(self._timing, [str(done), *(f"{value:.4g}" for value in times.values())])
-        for name, value in {**values, **times}.items():
-            if math.isfinite(value):
-                self._board.add_scalar(name, value, done)
+        self._board.write(done, {**values, **times})
 
     def close(self) -> None:
-        """Flush the TensorBoard events."""
+        """Close the TensorBoard events.
+
+        Raises:
+            UserError: they cannot be written.
+
+        """
         self._board.close()
+
+
+class _Board:
+    """TensorBoard events, written at once: a writer in a thread of its own would take a full disk to its grave."""
+
+    def __init__(self, folder: Path, first: int) -> None:
+        """Begin a file of events.  first: rows from this update on replace those of earlier files."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self._folder = folder
+        self._events = EventsWriter(str(folder / "events"))
+        self._add(Event(step=first, session_log=SessionLog(status=SessionLog.START)))
+
+    def write(self, done: int, values: Mapping[str, float]) -> None:
+        """Append the finite ones of some values."""
+        shown = [Summary.Value(tag=name, simple_value=value) for name, value in values.items() if math.isfinite(value)]
+        self._add(Event(step=done, summary=Summary(value=shown)))
+
+    def _add(self, event: Event) -> None:
+        event.wall_time = time.time()
+        try:
+            self._events.write_event(event)
+            self._events.flush()
+        except OSError as error:
+            raise UserError(f"{self._folder}: cannot be written: {error.strerror or error}") from None
+
+    def close(self) -> None:
+        try:
+            self._events.close()
+        except OSError as error:
+            raise UserError(f"{self._folder}: cannot be written: {error.strerror or error}") from None
 
 
 def _append(path: Path, cells: list[str]) -> str:

@@ -32,6 +32,8 @@ class ProcessArgs:
                     raise UserError(f"{name}: needs --coordinator, got {value} without it")
         elif not re.fullmatch(r"[^\s:]+:[0-9]{1,5}", self.coordinator):
             raise UserError(f"coordinator: must be host:port, got {self.coordinator!r}")
+        elif not 1 <= int(self.coordinator.rpartition(":")[2]) <= 65535:
+            raise UserError(f"coordinator: its port must be from 1 to 65535, got {self.coordinator!r}")
         if self.processes < 1:
             raise UserError(f"processes: must be 1 or more, got {self.processes}")
         if not 0 <= self.process < self.processes:

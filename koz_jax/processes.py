@@ -3,6 +3,7 @@
 With one process everything here is plain: it leads, and nothing is exchanged.
 """
 
+import hashlib
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -77,7 +78,26 @@ def raise_together(error: UserError | None) -> None:
 
     """
     if any_of(error is not None):
-        raise error or UserError("processes: another process has failed, and says why; this one ends with it")
+        error = error or UserError("processes: another process has failed, and says why; this one ends with it")
+        error.agreed = True
+        raise error
+
+
+def require_same(name: str, value: Any) -> None:
+    """Refuse to work together on different things.
+
+    Args:
+        name: of the value, for the message.
+        value: what must be the same in all processes; its text counts.
+
+    Raises:
+        UserError: it is not.
+
+    """
+    digest = np.frombuffer(hashlib.sha256(repr(value).encode()).digest(), np.uint8)
+    same = np.array_equal(digest, from_first(digest))
+    this = f"process {jax.process_index()} has another than the first"
+    raise_together(None if same else UserError(f"{name}: must be the same in all processes, but {this}"))
 
 
 def together(work: Callable[[], Result]) -> Result:

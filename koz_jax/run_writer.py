@@ -88,8 +88,8 @@ class RunWriter:
         """
         try:
             self._states.__exit__(kind, error, trace)
-            if kind is None and self._error is not None:
-                raise self._error
         finally:
             if self._log is not None:
-                self._log.close()
+                self._attempt(self._log.close)
+        if kind is None and self._error is not None:
+            raise self._error

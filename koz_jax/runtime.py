@@ -1,7 +1,9 @@
 """Process-wide settings of jax for the command lines; libraries and notebooks are left alone."""
 
 import os
+import socket
 import sys
+import time
 from pathlib import Path
 from types import TracebackType
 
@@ -9,6 +11,9 @@ import jax
 
 from koz_jax.errors import UserError
 from koz_jax.processes import any_of
+
+# [s] in which processes must find each other
+_WAIT_S = 300.0
 
 
 def configure() -> None:
@@ -38,7 +43,8 @@ def join(coordinator: str, processes: int, process: int) -> None:
     """Make this process one of several that work together, on this machine or on many.
 
     Call after ``configure`` and before anything touches a device.  A process that ends waits up to five minutes for the
-    others.  An exception that nobody catches ends it at once, and the others when they notice, within two minutes.
+    others.  An exception that nobody catches ends it at once (as does ``errors.exit_status`` where processes have not
+    agreed to end), and the others when they notice, within two minutes.
 
     Args:
         coordinator: address of the first process, as host:port.
@@ -49,12 +55,45 @@ def join(coordinator: str, processes: int, process: int) -> None:
         UserError: the others are not found.
 
     """
+    host, _, port = coordinator.rpartition(":")
+    if process == 0:
+        _check_free(int(port))
+    else:
+        _await(host, int(port))
+    # It would take SIGTERM, and do nothing.
+    jax.config.update("jax_enable_preemption_service", False)
     try:
         jax.distributed.initialize(coordinator, processes, process)
     except (RuntimeError, ValueError) as error:
         raise UserError(f"coordinator: {coordinator} cannot be joined: {str(error).splitlines()[0]}") from None
     sys.excepthook = _leave
     any_of(False)  # connects them, see ``processes.connect``
+
+
+def _check_free(port: int) -> None:
+    """Refuse a port that the first process cannot listen on: jax would crash."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("", port))
+        except OSError as error:
+            raise UserError(f"coordinator: port {port} cannot be listened on: {error.strerror}") from None
+
+
+def _await(host: str, port: int) -> None:
+    """Wait until the first process listens, for as long as jax would before it aborts."""
+    deadline = time.monotonic() + _WAIT_S
+    while True:
+        try:
+            socket.create_connection((host, port), timeout=5.0).close()
+            return
+        except socket.gaierror:
+            raise UserError(f"coordinator: there is no host {host!r}") from None
+        except OSError as error:
+            if time.monotonic() > deadline:
+                reason = error.strerror or str(error)
+                raise UserError(f"coordinator: nobody answers at {host}:{port} for {_WAIT_S:g} s: {reason}") from None
+            time.sleep(0.2)
 
 
 def _leave(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:

@@ -12,6 +12,7 @@ import queue
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -26,10 +27,12 @@ from koz_jax.interrupt import StopRequest
 from koz_jax.lock import FolderLock
 from koz_jax.run_folder import RunFolder
 from koz_jax.summary import Summary, summarise
-from koz_jax.trainer import score, train
+from koz_jax.trainer import checked_source, score, train
 
 # Shown while it is waited for the workers.
 _POLL_S = 0.5
+# Exit status of a worker that was told to stop (EX_TEMPFAIL).
+_STOPPED = 75
 
 
 class Plan(BaseModel):
@@ -77,14 +80,14 @@ def begin(run: Path, plan: Plan) -> None:
     """Make the folder of several seeds.
 
     Raises:
-        UserError: it is in use, cannot be made, or the last seed is too large.
+        UserError: it is in use, cannot be made, the last seed is too large, or a run cannot be (see ``train``).
 
     """
     if plan.config.seed + plan.seeds > 2**32:
         raise UserError(f"seeds: seed + seeds must be at most 2^32, got {plan.config.seed} and {plan.seeds}")
-    evaluation.check_feasible(plan.config.task, plan.config.eval_max_angle_deg, "eval_max_angle_deg")
     if run.exists() and (not run.is_dir() or any(run.iterdir())):
         raise UserError(f"run: {run} exists already; resume it with --resume {run}, or choose another folder")
+    checked_source(plan.config, plan.start_from)
     storage.make_folder("run", run)
     storage.write_text(plan_path(run), plan.model_dump_json(indent=2) + "\n")
 
@@ -126,7 +129,15 @@ def _train_one(run: Path, plan: Plan, number: int, free: queue.SimpleQueue[int],
         return ""
     core = free.get()
     folder = plan.folder(run, number)
-    job = {"config": plan.of(number).model_dump(), "run": str(folder.path), "start_from": plan.start_from, "core": core}
+    # Whatever ends this process closes the pipe, which the worker watches.
+    watched, held = os.pipe()
+    job = {
+        "config": plan.of(number).model_dump(),
+        "run": str(folder.path),
+        "start_from": plan.start_from,
+        "core": core,
+        "parent": watched,
+    }
     # A session of its own: Ctrl-C reaches the worker once, from here.
     with subprocess.Popen(
         [sys.executable, "-m", "koz_jax.seeds"],
@@ -135,13 +146,19 @@ def _train_one(run: Path, plan: Plan, number: int, free: queue.SimpleQueue[int],
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        pass_fds=(watched,),
         env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
     ) as process:
+        os.close(watched)
         errors = _communicate(process, json.dumps(job), stop)
+    os.close(held)
     free.put(core)
-    if stop.requested and process.returncode == -signal.SIGTERM:  # it came before the worker could take it
+    # SIGTERM kills a worker that cannot take it yet.
+    if process.returncode == 0 or (stop.requested and process.returncode in (_STOPPED, -signal.SIGTERM)):
         return ""
-    return f"{folder.path.name}: {errors.strip()[-2000:] or process.returncode}" if process.returncode else ""
+    if process.returncode == _STOPPED:
+        return f"{folder.path.name}: was told to stop by somebody else; go on with python train.py --resume {run}"
+    return f"{folder.path.name}: {errors.strip()[-2000:] or process.returncode}"
 
 
 def _communicate(process: subprocess.Popen[str], job: str, stop: StopRequest) -> str:
@@ -166,7 +183,7 @@ def judge(run: Path, plan: Plan, cases: int) -> tuple[Agent, list[Judged]]:
     judged, agents = [], []
     for number in range(plan.seeds):
         agent = load_agent(plan.folder(run, number).path)
-        results = evaluation.monte_carlo(agent, cases).results
+        results = evaluation.monte_carlo(agent, cases, shield=plan.config.shielding.in_force).results
         phase = agent.provenance.phase
         judged.append(
             Judged(seed=plan.of(number).seed, score=score(results, plan.config, phase), summary=summarise(results))
@@ -193,9 +210,16 @@ def table(judged: list[Judged], cases: int) -> str:
     return "\n".join(lines)
 
 
+def _stop_with(parent: int) -> None:
+    """Wait for the end of the process that began this one, and then stop as if told to.  parent: end of a pipe."""
+    os.read(parent, 1)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
 def _work() -> int:
     """Train the run that stands on the standard input.  Returns the exit status."""
     job = json.loads(sys.stdin.read())
+    threading.Thread(target=_stop_with, args=(job["parent"],), daemon=True).start()
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {job["core"]})
     from koz_jax import runtime  # the number of devices is that of the cores
@@ -203,8 +227,9 @@ def _work() -> int:
     runtime.configure()
     config, folder = TrainConfig.model_validate(job["config"]), RunFolder(Path(job["run"]))
     begun = folder.config.exists()
-    train(config, folder.path, resume=begun, start_from=None if begun else job["start_from"], progress=False)
-    return 0
+    start_from = None if begun else job["start_from"]
+    agent = train(config, folder.path, resume=begun, start_from=start_from, progress=False)
+    return 0 if agent is not None else _STOPPED
 
 
 if __name__ == "__main__":

@@ -61,7 +61,8 @@ def _put(tree: Any, sharding: NamedSharding) -> Any:
 def place(state: TrainState, devices: int) -> TrainState:
     """Divide a training state among the first ``devices`` devices of every process; on a single one it stays as it is.
 
-    The state is whole in every process, or was placed before.
+    The state is whole in every process, or was placed before.  What all devices have alike is that of the first process
+    again: machines of other kinds round in other ways.
     """
     if devices * jax.process_count() == 1:
         return state
@@ -70,10 +71,11 @@ def place(state: TrainState, devices: int) -> TrainState:
         NamedSharding(mesh, PartitionSpec(*axes)) for axes in ((), (_AXIS,), (None, _AXIS))
     )
     shared = (state.learner, state.buffer.head, state.buffer.size, state.updates, state.key)
-    if any(leaf.sharding != everywhere for leaf in jax.tree.leaves(shared)):
-        # Those of the first process: other machines round in other ways.
+    placed = all(leaf.sharding == everywhere for leaf in jax.tree.leaves(shared))
+    if not placed or jax.process_count() > 1:
         *others, key_data = processes.from_first(storage.key_data(shared))
-        processes.connect(mesh)
+        if not placed:
+            processes.connect(mesh)
         # Spelled as a training step spells it, which would be compiled for another spelling once more.
         key = jax.random.wrap_key_data(_put(key_data, NamedSharding(mesh, PartitionSpec(None))))
         shared = (*_put(others, everywhere), key)

@@ -66,10 +66,12 @@ def train(
     if resume and start_from is not None:
         raise UserError(f"start_from: a resumed run goes on from its own checkpoint, got {start_from}")
     folder = RunFolder(Path(run))
-    sharding.check(config, devices)
+    # All of several processes come here, so that they can say it together.
+    processes.together(lambda: sharding.check(config, devices))
+    processes.require_same("settings", (config, resume, start_from and str(start_from), devices, koz_jax.__version__))
     opening = _resumed(folder, config) if resume else _begun(folder, config, start_from)
-    with StopRequest() as stop, contextlib.ExitStack() as stack:
-        saved = processes.together(lambda: stack.enter_context(opening))
+    with StopRequest() as stop, opening as saved:
+        processes.require_same("checkpoint", (saved.state.done, saved.log))
         with Progress(config, saved.state.done, enabled=progress and processes.leads()) as bar:
             bar.note(f"run folder: {folder.path}")
             with _memory_errors():
@@ -79,28 +81,53 @@ def train(
 @contextlib.contextmanager
 def _resumed(folder: RunFolder, config: TrainConfig) -> Iterator[Checkpoint]:
     """A run to go on with, locked."""
-    if not folder.config.is_file():
-        raise UserError(f"resume: {folder.path} is not a run folder (it has no {folder.config.name})")
-    with FolderLock(folder.path) if processes.leads() else contextlib.nullcontext():
-        template = _template(config)
-        memory.check(config, template.train.buffer, template)
-        yield load_checkpoint(folder, config, template)
+    with contextlib.ExitStack() as stack:
+
+        def read() -> Checkpoint:
+            if not folder.config.is_file():
+                raise UserError(f"resume: {folder.path} is not a run folder (it has no {folder.config.name})")
+            if processes.leads():
+                stack.enter_context(FolderLock(folder.path))
+            template = _template(config)
+            memory.check(config, template.train.buffer, template)
+            return load_checkpoint(folder, config, template)
+
+        yield processes.together(read)
 
 
 @contextlib.contextmanager
 def _begun(folder: RunFolder, config: TrainConfig, start_from: Path | str | None) -> Iterator[Checkpoint]:
     """A new run, locked, with its first checkpoint; on an error before that nothing is left of it."""
-    evaluation.check_feasible(config.task, config.eval_max_angle_deg, "eval_max_angle_deg")
-    with folder.begin() if processes.leads() else contextlib.nullcontext():
-        template = _template(config)
-        memory.check(config, template.train.buffer, template)
-        source = None if start_from is None else load_source(Path(start_from), config, template)
-        with _memory_errors():
-            state = _begin(config, source)
-        if processes.leads():
-            storage.save_tree(folder.checkpoint(0), state, record_of(state, config))
-            folder.write_config(config)
+    with contextlib.ExitStack() as stack:
+
+        def prepare() -> RunState:
+            if processes.leads():
+                stack.enter_context(folder.begin())
+            source = checked_source(config, start_from)
+            with _memory_errors():
+                return _begin(config, source)
+
+        def write() -> None:
+            if processes.leads():
+                storage.save_tree(folder.checkpoint(0), state, record_of(state, config))
+                folder.write_config(config)
+
+        state = processes.together(prepare)
+        processes.together(write)
         yield Checkpoint(state, "")
+
+
+def checked_source(config: TrainConfig, start_from: Path | str | None) -> RunState | None:
+    """Refuse a run that cannot be.  Returns what it begins with, where that is another run's.
+
+    Raises:
+        UserError: there is no room for a zone, too little memory, or nothing to begin with where it should be.
+
+    """
+    evaluation.check_feasible(config.task, config.eval_max_angle_deg, "eval_max_angle_deg")
+    template = _template(config)
+    memory.check(config, template.train.buffer, template)
+    return None if start_from is None else load_source(Path(start_from), config, template)
 
 
 @contextlib.contextmanager
@@ -222,7 +249,8 @@ class _Run:
         placed = sharding.place(state.train, self.devices)
         train_state, metrics = processes.finished(training.train_chunk(self.config, placed, np.int32(steps)))
         metrics = jax.device_get(metrics)
-        watch.check(end, int(metrics.fault), {"learner": train_state.learner, "environments": train_state.env_states})
+        parts = {"learner": train_state.learner, "environments": train_state.env_states}
+        processes.together(lambda: watch.check(end, int(metrics.fault), parts))
         warning = watch.divergence(self.config, metrics.learner)
         if warning is not None and not self.warned:
             self.bar.warn(f"update {end}: {warning}")
@@ -241,7 +269,8 @@ class _Run:
         done = state.done
         end = self._chunk_end(done, self.config.refine_log_every)
         refined, cost = refine.refine_chunk(self.config, state.refine, jnp.int32(end - done))
-        watch.check(end, watch.SOUND, {"refine/cost": cost, "refine/state": refined})
+        parts = {"refine/cost": cost, "refine/state": refined}
+        processes.together(lambda: watch.check(end, watch.SOUND, parts))
         return state.replace(refine=refined), {"refine/cost": float(cost)}
 
     def _evaluate(self, state: RunState, out: RunWriter) -> tuple[RunState, dict[str, float]]:
@@ -279,7 +308,7 @@ class _Run:
             _EVAL_SEED,
             self.config.eval_min_angle_deg,
             self.config.eval_max_angle_deg,
-            shield=self.config.shielding.shield if self.config.shielding.enabled else None,
+            shield=self.config.shielding.in_force,
         )
         controller = PolicyController(learner.averaged_policy, self.config.network)
         results = evaluation.fly_cases(controller, self.config.task, cases)

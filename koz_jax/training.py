@@ -83,9 +83,8 @@ def _reset_envs(config: TrainConfig, params: EnvParams, at: Difficulty, key: jax
 
 def make_shield(config: TrainConfig, params: EnvParams) -> Shield | None:
     """The shield to train under, if there is one."""
-    if not config.shielding.enabled:
-        return None
-    return shield.for_spacecraft(config.shielding.shield, params.spacecraft, params.dt)
+    made = config.shielding.in_force
+    return shield.for_spacecraft(made, params.spacecraft, params.dt) if made else None
 
 
 def _observer(config: TrainConfig, params: EnvParams) -> Callable[[EnvState], jax.Array]:

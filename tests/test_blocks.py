@@ -208,6 +208,11 @@ def test_a_folder_that_one_process_refuses_ends_in_all(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
+def test_processes_without_a_block_of_their_own_wait_for_the_others(tmp_path, capfd):
+    tiny.ended(tiny.begin_two("eval_mc.py", "--cases", 5, "--partial", tmp_path / "kept"), 0, 0)
+    assert capfd.readouterr().out.count("5 cases ") == 1
+
+
 def test_processes_that_do_not_exist_are_refused(capsys):
     argv = ["--coordinator", "127.0.0.1:1", "--processes", 2, "--process", 2]
     assert tiny.status("eval_mc", *argv) == 2

@@ -1,12 +1,15 @@
 """Several seeds at once: each run is the one of its seed alone, stopped or not, and the best of all is kept."""
 
+import concurrent.futures
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +18,7 @@ import tiny
 from koz_jax import evaluation, seeds, storage
 from koz_jax.agent import load_agent
 from koz_jax.errors import UserError
+from koz_jax.lock import FolderLock
 from koz_jax.run_folder import RunFolder
 from koz_jax.trainer import score
 
@@ -74,6 +78,69 @@ def test_bad_numbers_of_seeds_and_used_folders_are_refused(tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
+def test_a_beginning_that_cannot_be_leaves_nothing(tmp_path, capsys):
+    flags = [*tiny.FLAGS, "--seeds", 2, "--run", tmp_path / "run", "--start-from", tmp_path / "nowhere"]
+    assert tiny.status("train", *flags) == 2
+    assert "start_from: " in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+LONG = seeds.Plan(config=tiny.changed({"curriculum": {"phase2": {"updates": 64_000}}}), seeds=1, start_from=None)
+
+
+def await_training(run: Path) -> RunFolder:
+    """Wait until the only seed of a run trains."""
+    folder = LONG.folder(run, 0)
+    deadline = time.monotonic() + 200
+    while not (folder.path / "metrics.csv").exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return folder
+
+
+def test_a_worker_that_was_stopped_alone_is_no_finished_run(tmp_path, monkeypatch):
+    workers = []
+
+    class Noted(subprocess.Popen):
+        def __init__(self, *args: Any, **options: Any) -> None:
+            super().__init__(*args, **options)
+            workers.append(self)
+
+    monkeypatch.setattr(seeds.subprocess, "Popen", Noted)
+    seeds.begin(tmp_path / "run", LONG)
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        trained = pool.submit(seeds.train_all, tmp_path / "run", LONG, progress=False)
+        await_training(tmp_path / "run")
+        workers[0].terminate()
+        with pytest.raises(UserError, match="seed-0: was told to stop by somebody else; go on with"):
+            trained.result()
+
+
+TRAIN_ALL = """
+import sys, pathlib
+from koz_jax import seeds
+run = pathlib.Path(sys.argv[1])
+seeds.train_all(run, seeds.read_plan(run), progress=False)
+"""
+
+
+def test_workers_stop_with_the_process_that_began_them(tmp_path):
+    run = tmp_path / "run"
+    seeds.begin(run, LONG)
+    with subprocess.Popen([sys.executable, "-c", TRAIN_ALL, run], env=tiny.environment()) as process:
+        folder = await_training(run)
+        process.kill()
+    deadline = time.monotonic() + 60
+    while True:  # until the worker has let go of its folder
+        try:
+            with FolderLock(folder.path):
+                break
+        except UserError:
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+    newest = folder.checkpoints()[0]
+    assert 0 < storage.read_record(newest)["done"] < LONG.config.length
+
+
 def test_a_tampered_plan_is_refused(tmp_path):
     plan = seeds.Plan(config=tiny.CONFIG, seeds=2, start_from=None)
     seeds.begin(tmp_path / "run", plan)
@@ -85,7 +152,9 @@ def test_a_tampered_plan_is_refused(tmp_path):
 
 
 def test_a_failing_worker_is_named(tmp_path):
-    plan = seeds.Plan(config=tiny.CONFIG, seeds=1, start_from=str(tmp_path / "nowhere"))
+    source = shutil.copytree(tiny.finished_run().path, tmp_path / "nowhere")
+    plan = seeds.Plan(config=tiny.CONFIG, seeds=1, start_from=str(source))
     seeds.begin(tmp_path / "run", plan)
+    shutil.rmtree(source)
     with pytest.raises(UserError, match=r"seed-0: error: start_from: .*nowhere is neither a run"):
         seeds.train_all(tmp_path / "run", plan, progress=False)

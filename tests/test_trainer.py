@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import errno
 import hashlib
 import json
 import math
@@ -21,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny
+from tensorboardX.event_file_writer import EventsWriter
 from tiny import CONFIG
 
 from koz_jax import storage, trainer, training
@@ -157,6 +159,19 @@ def test_metrics_go_to_tensorboard_too(run):
     content = events.read_bytes()
     for name in (b"train/critic_loss", b"eval/success_rate", b"curriculum/zone_weight"):
         assert name in content
+
+
+def test_a_disk_that_is_full_for_tensorboard_is_named(tmp_path, monkeypatch):
+    log = MetricsLog(tmp_path, "", 0)
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(EventsWriter, "flush", full)
+    with pytest.raises(UserError, match=r"tensorboard: cannot be written: No space left on device"):
+        log.write(1, {"a": 1.0}, {"b": 2.0})
+    with pytest.raises(UserError, match=r"tensorboard: cannot be written"):
+        log.close()
 
 
 def test_agents_tell_where_they_come_from(run):

@@ -57,7 +57,14 @@ def merged(settings: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 
 CONFIG = TrainConfig.model_validate(merged(preset("paper").model_dump(), SETTINGS))
-UNREFINED = TrainConfig.model_validate(merged(CONFIG.model_dump(), {"refine": {"iterations": 0}}))
+
+
+def changed(changes: dict[str, Any]) -> TrainConfig:
+    """``CONFIG`` with some settings changed."""
+    return TrainConfig.model_validate(merged(CONFIG.model_dump(), changes))
+
+
+UNREFINED = changed({"refine": {"iterations": 0}})
 
 
 def flags(settings: dict[str, Any], prefix: str = "--") -> list[str]:
