@@ -100,7 +100,9 @@ def _off_policy(library: str, algorithm: str, minutes: float) -> Run:
     recorder = Recorder(minutes)
     model = make("MlpPolicy", env, seed=0, learning_starts=8192, gradient_steps=UPDATES, **settings)
     policy = _sbx_policy if library == "sbx-rl" else _torch_policy
-    recipe = f"library defaults{noise}; {ENVS} environments, {UPDATES} updates per step of all of them"
+    recipe = (
+        f"library defaults{noise}, learning_starts 8192; {ENVS} environments, {UPDATES} updates per step of all of them"
+    )
     return _learn(recorder, model, policy, recipe, f"{library} {metadata.version(library)}")
 
 

@@ -15,6 +15,7 @@ from koz_jax.agent_files import Provenance, Record, find_agent, read_agent_recor
 from koz_jax.config import NetworkConfig
 from koz_jax.controllers.base import Memoryless
 from koz_jax.env import EnvParams, EnvState
+from koz_jax.errors import UserError
 from koz_jax.layout import ACTION_SIZE, as_observations
 from koz_jax.numpy_policy import NumpyPolicy, from_arrays
 from koz_jax.sac.networks import Params, Policy
@@ -90,12 +91,21 @@ def _act(controller: PolicyController, observed: jax.Array) -> jax.Array:
     return controller.act(observed)
 
 
-def load_agent(name: str | Path = "phase2") -> Agent:
-    """Load an agent by name or folder, see ``find_agent``; or a zip of Stable-Baselines3, see ``sb3_policy``."""
+def load_agent(name: str | Path = "phase2", task: TaskConfig | None = None) -> Agent:
+    """Load an agent by name or folder, see ``find_agent``; or a zip of Stable-Baselines3, see ``sb3_policy``.
+
+    task: what the agent of a zip was trained for, by default the paper's; agents of ours know theirs.
+
+    Raises:
+        UserError: there is no such agent, its files are damaged, or it is not of the task.
+
+    """
     if is_sb3(name):
-        record, arrays = read_sb3(name)
+        record, arrays = read_sb3(name, task or TaskConfig())
         policy = unflatten_dict({leaf: jnp.asarray(array) for leaf, array in arrays.items()}, sep="/")
         return Agent(PolicyController(policy, record.network), record.task, record.provenance, str(name))
+    if task is not None:
+        raise UserError(f"task: is told for zips of Stable-Baselines3 only, got one for {name}")
     folder = find_agent(name)
     record = read_agent_record(folder)
     template = jax.eval_shape(

@@ -2,6 +2,7 @@
 
 The core (``env``, ``observation``, ``reward``) does not need brax; this adapter is for code that speaks its contract.
 Give brax's trainers ``wrap_env_fn=wrap_for_training``: their own wrapper replays every environment's first scenario.
+So does ``brax.envs.create``; instead: ``wrap_for_training(env := get_environment(ENV_NAME), env.episode_steps)``.
 """
 
 import contextlib
@@ -131,6 +132,9 @@ def wrap_for_training(
     """Batch, cut into episodes and resample; for the argument ``wrap_env_fn`` of brax's trainers."""
     if randomization_fn is not None:
         raise UserError(f"randomization_fn: this environment has no brax System to randomise, got {randomization_fn}")
+    for name, value in {"episode_length": episode_length, "action_repeat": action_repeat}.items():
+        if value < 1:
+            raise UserError(f"{name}: must be 1 or more, got {value}")
     return ResampleWrapper(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
 
 

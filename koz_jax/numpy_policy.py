@@ -52,7 +52,7 @@ class NumpyPolicy:
 
 
 def load_policy(name: str | Path = "phase2") -> NumpyPolicy:
-    """Load an agent by name or folder, as ``load_agent`` does.
+    """Load an agent of ours by name or folder, see ``find_agent``.
 
     Raises:
         UserError: there is no such agent, or its files are damaged.

@@ -84,3 +84,5 @@ def test_episodes_shorter_than_the_maneuver_are_counted_from_each_reset():
 def test_randomisation_of_a_brax_system_is_refused():
     with pytest.raises(UserError, match="randomization_fn: "):
         wrap_for_training(ENV, randomization_fn=lambda system: system)
+    with pytest.raises(UserError, match="episode_length: must be 1 or more, got 0"):
+        wrap_for_training(ENV, 0)

@@ -16,7 +16,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from koz_jax.agent import load_agent
 from koz_jax.errors import UserError
-from koz_jax.layout import SIZE
+from koz_jax.layout import SIZE, size
+from koz_jax.sb3_env import ReorientationVecEnv
+from koz_jax.task_config import TaskConfig
 
 
 class Spaces(gymnasium.Env):
@@ -149,3 +151,23 @@ def test_without_torch_it_says_what_to_install(good):
     )
     done = tiny.run_python("-c", code)
     assert 'needs torch to be read: pip install "koz_jax[sb3]"' in done.stdout
+
+
+def test_an_agent_of_another_task_is_flown_in_that_task_or_refused(tmp_path):
+    weak = TaskConfig.model_validate({"spacecraft": {"torque_limit": 0.4}, "scenario": {"max_zones": 3}})
+    model = SAC("MlpPolicy", ReorientationVecEnv(2, weak), policy_kwargs={"net_arch": [8]}, buffer_size=10)
+    path = saved(model, tmp_path)
+    with pytest.raises(UserError, match="its observation must have 16 numbers, got 26"):
+        load_agent(path)
+    stronger = weak.model_copy(update={"spacecraft": TaskConfig().spacecraft})
+    with pytest.raises(UserError, match=r"its observations are not those of the task .* task=TaskConfig"):
+        load_agent(path, stronger)
+    agent = load_agent(path, weak)
+    assert agent.task == weak and agent.controller.network.observed_zones == 3
+    batch = np.random.default_rng(0).normal(size=(100, size(3))).astype(np.float32)
+    # Stable-Baselines3 gives what it has clipped to its action space.
+    np.testing.assert_allclose(agent.predict(batch), model.predict(batch, deterministic=True)[0], rtol=0, atol=1e-6)
+    agent.save(tmp_path / "agent")
+    assert load_agent(tmp_path / "agent").task == weak
+    with pytest.raises(UserError, match=r"task: is told for zips of Stable-Baselines3 only"):
+        load_agent(tmp_path / "agent", weak)

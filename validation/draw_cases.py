@@ -97,7 +97,8 @@ def spacecraft(task: TaskConfig) -> dict[str, np.ndarray]:
         "boresight_B": np.array(task.spacecraft.boresight),
         "step_seconds": np.array(task.step_seconds),
         "steps": np.array(task.episode_steps),
-        "settled_angle": np.deg2rad(task.reward.settled_angle_deg),
+        # Of the full rotation, whatever the convention.
+        "settled_angle": np.deg2rad(task.reward.settled_angle_deg) / (1.0 if task.angle_convention == "full" else 0.5),
     }
 
 
