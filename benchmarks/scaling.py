@@ -80,21 +80,19 @@ def measure(worker: Worker) -> Times:
 
     import jax
     import numpy as np
-    from jax.experimental import multihost_utils
 
-    from koz_jax import evaluation, sharding, training
+    from koz_jax import evaluation, processes, sharding, training
     from koz_jax.agent import load_agent
     from koz_jax.evaluation import MonteCarloConfig
     from koz_jax.presets import preset
 
-    def together() -> None:
-        if worker.layout.processes > 1:
-            multihost_utils.sync_global_devices("begin")
+    def begin() -> None:
+        processes.any_of(False)
 
     agent = load_agent("phase2")
     share = CASES // worker.layout.processes
     cases = MonteCarloConfig(share, first=share * worker.process)
-    monte_carlo = best_seconds(lambda: evaluation.fly_cases(agent.controller, agent.task, cases), together)
+    monte_carlo = best_seconds(lambda: evaluation.fly_cases(agent.controller, agent.task, cases), begin)
 
     def training_step(num_envs: int, more: int) -> float:
         fast = preset("fast")
@@ -106,10 +104,10 @@ def measure(worker: Worker) -> Times:
         def chunk() -> None:
             nonlocal state
             state = sharding.place(state, worker.layout.devices)
-            state, metrics = training.train_chunk(config, state, np.int32(STEPS))  # pyright: ignore[reportArgumentType]
-            jax.block_until_ready(metrics)
+            trained = training.train_chunk(config, state, np.int32(STEPS))  # pyright: ignore[reportArgumentType]
+            state, _ = processes.finished(trained)
 
-        return best_seconds(chunk, together) / STEPS
+        return best_seconds(chunk, begin) / STEPS
 
     return Times(
         monte_carlo=monte_carlo,
