@@ -3,8 +3,9 @@
 With one process everything here is plain: it leads, and nothing is exchanged.
 """
 
+import contextlib
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import jax
@@ -53,12 +54,30 @@ def connect(mesh: Mesh) -> None:
 
 def whole(tree: Any, mesh: Mesh) -> Any:
     """Make a pytree whose leaves are divided among the devices of a mesh whole, as NumPy arrays, in every process."""
-    copies = jax.jit(_same, out_shardings=NamedSharding(mesh, PartitionSpec()))(tree)
-    return jax.tree.map(lambda leaf: np.asarray(leaf.addressable_data(0)), finished(copies))
+    with exchange():
+        copies = finished(jax.jit(_same, out_shardings=NamedSharding(mesh, PartitionSpec()))(tree))
+    return jax.tree.map(lambda leaf: np.asarray(leaf.addressable_data(0)), copies)
 
 
 def _same(tree: Any) -> Any:
     return tree
+
+
+@contextlib.contextmanager
+def exchange() -> Iterator[None]:
+    """Say it in one line when another process does not take part in an exchange.
+
+    Raises:
+        UserError: it has ended, or was waited for in vain.
+
+    """
+    try:
+        yield
+    except (ValueError, jax.errors.JaxRuntimeError) as error:
+        if "Gloo" not in str(error):
+            raise
+        reason = str(error).splitlines()[0]
+        raise UserError(f"processes: another process has ended, or does not answer: {reason}") from None
 
 
 def finished(tree: Any) -> Any:

@@ -247,7 +247,8 @@ class _Run:
         end = self._chunk_end(done, self.config.log_every)
         steps = (end - done) // self.config.updates_per_step
         placed = sharding.place(state.train, self.devices)
-        train_state, metrics = processes.finished(training.train_chunk(self.config, placed, np.int32(steps)))
+        with processes.exchange():
+            train_state, metrics = processes.finished(training.train_chunk(self.config, placed, np.int32(steps)))
         metrics = jax.device_get(metrics)
         parts = {"learner": train_state.learner, "environments": train_state.env_states}
         processes.together(lambda: watch.check(end, int(metrics.fault), parts))

@@ -16,7 +16,7 @@ AGREE = """
 import sys, time
 import numpy as np
 from koz_jax import processes, runtime
-from koz_jax.errors import UserError
+from koz_jax.errors import UserError, exit_status
 coordinator, me = sys.argv[2], int(sys.argv[6])
 runtime.join(coordinator, 2, me)
 assert processes.leads() == (me == 0)
@@ -47,18 +47,15 @@ else:
     raise AssertionError("a difference was lost")
 if me == 1:
     raise RuntimeError("nobody expects this")
-time.sleep(600)
+sys.exit(exit_status(lambda: processes.any_of(False)))
 """
 
 
-def test_processes_agree_and_one_that_fails_ends_at_once():
-    first, second = tiny.begin_two("-c", AGREE)
-    try:
-        assert "RuntimeError: nobody expects this" in tiny.ended([second], 1)[0]
-        assert first.poll() is None
-    finally:
-        first.kill()
-        tiny.ended([first], -9)
+def test_processes_agree_and_when_one_fails_all_end():
+    errors = tiny.ended(tiny.begin_two("-c", AGREE), 2, 1)
+    assert "error: processes: another process has ended, or does not answer: " in errors[0]
+    assert "Traceback" not in errors[0]
+    assert "RuntimeError: nobody expects this" in errors[1]
 
 
 def test_one_process_agrees_with_itself():
