@@ -63,6 +63,14 @@ class FlightArgs:
             return None
         return UncertaintyConfig(**{name: getattr(self, name) for name in names})
 
+    @property
+    def shield_config(self) -> ShieldConfig | None:
+        """The shield to fly under, if one is asked for."""
+        if not self.shield:
+            return None
+        withstands = (self.uncertainty if self.robust else None) or CERTAIN
+        return ShieldConfig(margin_deg=self.shield_margin_deg, withstands=withstands)
+
     def config(self, substeps: int = 1) -> MonteCarloConfig:
         """Which cases are flown, and how.
 
@@ -79,14 +87,13 @@ class FlightArgs:
                 raise UserError(f"shield_margin_deg: needs --shield, got {self.shield_margin_deg} without it")
         if self.robust and self.uncertainty is None:
             raise UserError("robust: needs an error to withstand, such as --inertia-error 0.1")
-        withstands = (self.uncertainty if self.robust else None) or CERTAIN
         return MonteCarloConfig(
             cases=self.cases,
             seed=self.seed,
             min_angle_deg=self.min_angle_deg,
             max_angle_deg=self.max_angle_deg,
             substeps=substeps,
-            shield=ShieldConfig(margin_deg=self.shield_margin_deg, withstands=withstands) if self.shield else None,
+            shield=self.shield_config,
             uncertainty=self.uncertainty,
         )
 
@@ -101,9 +108,8 @@ class FlightArgs:
     def task(self, pilot: Pilot) -> TaskConfig:
         """What is flown: the task that the pilot was made for, with the changes that the flags ask for."""
         task = pilot.task.with_rules(self.angle_convention, self.infeasible_zone, self.zones, self.max_rate_deg)
-        shield = self.config().shield
-        if shield is not None:
-            shield.check(task.spacecraft.torque_limit)
+        if self.shield_config is not None:
+            self.shield_config.check(task.spacecraft.torque_limit)
         return task
 
     @property

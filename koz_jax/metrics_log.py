@@ -1,9 +1,10 @@
 """Training curves: one CSV row per logged chunk, and the same numbers for TensorBoard."""
 
+import contextlib
 import csv
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -40,14 +41,12 @@ class MetricsLog:
         self._timing = folder / "timing.csv"
         self._lines = [text]
         self._columns: list[str] = text.partition("\n")[0].split(",") if text else []
-        try:
+        with _writing(folder):
             if text:
                 storage.write_text(self._path, text)
             else:
                 self._path.unlink(missing_ok=True)
             self._board = _Board(folder / "tensorboard", resume_at + 1)
-        except OSError as error:
-            raise UserError(f"{folder}: cannot be written: {error.strerror or error}") from None
 
     @property
     def text(self) -> str:
@@ -103,28 +102,30 @@ class _Board:
 
     def _add(self, event: Event) -> None:
         event.wall_time = time.time()
-        try:
+        with _writing(self._folder):
             self._events.write_event(event)
             self._events.flush()
-        except OSError as error:
-            raise UserError(f"{self._folder}: cannot be written: {error.strerror or error}") from None
 
     def close(self) -> None:
-        try:
+        with _writing(self._folder):
             self._events.close()
-        except OSError as error:
-            raise UserError(f"{self._folder}: cannot be written: {error.strerror or error}") from None
 
 
 def _append(path: Path, cells: list[str]) -> str:
     """Add a line to a file.  Returns it."""
     line = ",".join(cells) + "\n"
+    with _writing(path), open(path, "a", encoding="utf-8", newline="") as file:
+        file.write(line)
+    return line
+
+
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Name what cannot be written."""
     try:
-        with open(path, "a", encoding="utf-8", newline="") as file:
-            file.write(line)
+        yield
     except OSError as error:
         raise UserError(f"{path}: cannot be written: {error.strerror or error}") from None
-    return line
 
 
 def read_metrics(path: Path) -> list[dict[str, str]]:

@@ -126,7 +126,7 @@ class RunFolder:
             raise UserError(f"run: {self.path} exists already; resume it with --resume {self.path}")
         try:
             shutil.rmtree(self.path / "checkpoints", ignore_errors=True)  # of a beginning that was killed
-            for half_written in self.path.glob(f".{self.config.name}.*"):
+            for half_written in self._half_written():
                 half_written.unlink()
             yield
         finally:
@@ -138,10 +138,13 @@ class RunFolder:
         """Whether the folder is empty, or holds only what a killed beginning left."""
         first = self.checkpoint(0)
         left_over = {LOCK, first.parent.name, first.name, f".{first.name}.new"}
-        half_written = f".{self.config.name}."
+        left_over |= {path.name for path in self._half_written()}
         places = [self.path, *([first.parent] if first.parent.is_dir() else [])]
-        found = [path.name for place in places for path in place.iterdir()]
-        return all(name in left_over or name.startswith(half_written) for name in found)
+        return all(path.name in left_over for place in places for path in place.iterdir())
+
+    def _half_written(self) -> list[Path]:
+        """What a kill left of the configuration that was being written."""
+        return list(self.path.glob(f".{self.config.name}.*"))
 
     def write_config(self, config: TrainConfig) -> None:
         """Write the configuration of a run that has begun."""

@@ -44,7 +44,7 @@ def join(coordinator: str, processes: int, process: int) -> None:
 
     Call after ``configure`` and before anything touches a device.  A process that ends waits up to five minutes for the
     others.  An exception that nobody catches ends it at once (as does ``errors.exit_status`` where processes have not
-    agreed to end), and the others when they notice, within two minutes.
+    agreed to end), and the others at their next exchange.
 
     Args:
         coordinator: address of the first process, as host:port.

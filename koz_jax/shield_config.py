@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from koz_jax.errors import UserError
-from koz_jax.settings import HalfAngleDeg, NonNegativeFloat, PositiveFloat, PositiveInt, Settings, ShareBelowOne
+from koz_jax.settings import MarginDeg, NonNegativeFloat, PositiveFloat, PositiveInt, Settings, ShareBelowOne
 
 
 class UncertaintyConfig(Settings):
@@ -25,7 +25,7 @@ CERTAIN = UncertaintyConfig()
 class ShieldConfig(Settings):
     """The shield."""
 
-    margin_deg: HalfAngleDeg = 0.1
+    margin_deg: MarginDeg = 0.1
     """Angle kept from every zone [deg]; more is kept where attitude noise is withstood."""
     withstands: UncertaintyConfig = CERTAIN
     """Errors for which the guarantee holds."""

@@ -539,6 +539,7 @@ def test_a_run_that_cannot_begin_leaves_nothing(tmp_path, monkeypatch):
 
 def test_a_beginning_that_was_killed_is_no_obstacle(tmp_path, monkeypatch):
     (tmp_path / "run" / "checkpoints" / ".0000000000.new").mkdir(parents=True)
+    (tmp_path / "run" / ".config.json.4711").write_text("{")
     (tmp_path / "run" / "lock").write_text("pid 1\n")
     monkeypatch.setattr(trainer._Run, "go", lambda *_: None)
     assert train(CONFIG, tmp_path / "run", progress=False) is None

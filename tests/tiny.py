@@ -168,6 +168,11 @@ def ended(workers: list[subprocess.Popen[str]], *status: int) -> list[str]:
     return errors
 
 
+def make_test(folder: Path) -> subprocess.CompletedProcess[str]:
+    """Compile and run the self-tests of an export to C."""
+    return subprocess.run(["make", "-C", folder, "test"], capture_output=True, text=True, check=False)
+
+
 def contents(folder: Path) -> dict[Path, bytes | None]:
     """Everything in a folder."""
     return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
