@@ -4,29 +4,40 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 
-.PHONY: train evaluate test lint benchmark figures notebooks
+.PHONY: train evaluate test test-fast test-pythons lint docs benchmark figures notebooks
 
 train: $(VENV)/.core
-	$(BIN)/python train.py $(ARGS)
+	$(BIN)/koz train $(ARGS)
 
 evaluate: $(VENV)/.core
-	$(BIN)/python eval_mc.py $(ARGS)
+	$(BIN)/koz evaluate $(ARGS)
 
 test: $(VENV)/.dev
 	$(BIN)/python -m pytest -n auto --dist loadfile $(ARGS)
+
+test-fast: $(VENV)/.dev
+	$(BIN)/python -m pytest -n auto --dist loadfile -m "not slow and not gpu" $(ARGS)
+
+# A short selection on every Python that is found, and once with the lowest versions of pyproject.toml.
+test-pythons:
+	$(PYTHON) tools/test_pythons.py $(ARGS)
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/basedpyright
 
+# Into build/site; a warning is an error.
+docs: $(VENV)/.dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict $(ARGS)
+
 benchmark: $(VENV)/.core
 	$(BIN)/python benchmarks/speed.py $(ARGS)
 
-# The pictures in README.md.
+# The pictures in README.md and on the site.
 figures: $(VENV)/.dev
-	$(BIN)/python fly.py --agent phase1 --out docs/figures/phase1
-	$(BIN)/python fly.py --agent phase2 --out docs/figures/phase2 --gif
+	$(BIN)/koz fly --agent phase1 --out docs/figures/phase1
+	$(BIN)/koz fly --agent phase2 --out docs/figures/phase2 --gif
 
 notebooks: $(VENV)/.dev
 	$(BIN)/python notebooks/build.py $(ARGS)

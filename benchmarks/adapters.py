@@ -12,10 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from koz_jax import vector_env
-from koz_jax.brax_env import ReorientationEnv, wrap_for_training
-from koz_jax.gym_env import ENV_ID
-from koz_jax.sb3_env import ReorientationVecEnv
+from koz_jax.adapters import vector_env
+from koz_jax.adapters.brax_env import ReorientationEnv, wrap_for_training
+from koz_jax.adapters.gym_env import ENV_ID
+from koz_jax.adapters.sb3_env import ReorientationVecEnv
+from koz_jax.task.environment import Reorientation
 
 ENVS = 1024
 
@@ -34,12 +35,12 @@ def steps_per_second(step: Callable[[], Any], envs: int, calls: int = 1100, repe
 
 def in_jax(envs: int, calls: int = 1100) -> float:
     """The core in one jitted loop, with no NumPy between the steps."""
-    flown = vector_env.maneuvers()
-    state, _ = vector_env.reset(flown, jax.random.split(jax.random.key(0), envs), jnp.zeros(envs, jnp.int32))
+    env = Reorientation.from_config()
+    state, _ = vector_env.reset(env, jax.random.split(jax.random.key(0), envs), jnp.zeros(envs, jnp.int32))
     action = jnp.full((envs, 3), 0.1)
 
     def advance(carry: vector_env.VectorState, _: None) -> tuple[vector_env.VectorState, jax.Array]:
-        after, stepped = vector_env.step(flown, carry, action)
+        after, stepped = vector_env.step(env, carry, action)
         return after, stepped.reward.sum() + stepped.observation.sum()
 
     loop = jax.jit(lambda state: jax.lax.scan(advance, state, None, length=calls))
@@ -62,7 +63,7 @@ def by_brax(envs: int, calls: int = 1100) -> float:
 
 def rates() -> dict[str, float]:
     """Environment steps per second by adapter, at ``ENVS`` environments but for the single one."""
-    single = gymnasium.make("koz_jax.gym_env:koz_jax/Reorientation-v0")
+    single = gymnasium.make("koz_jax.adapters.gym_env:koz_jax/Reorientation-v0")
     vector, sb3 = gymnasium.make_vec(ENV_ID, num_envs=ENVS), ReorientationVecEnv(ENVS)
     single.reset(seed=0)
     vector.reset(seed=0)

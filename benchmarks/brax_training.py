@@ -17,10 +17,10 @@ import jax
 import jax.numpy as jnp
 import tyro
 from flax import linen
-from mlp import MlpController, judge
+from mlp import MlpController, evaluate
 
-from koz_jax.brax_env import ENV_NAME, wrap_for_training
-from koz_jax.task_config import TaskConfig
+from koz_jax.adapters.brax_env import ENV_NAME, wrap_for_training
+from koz_jax.config.task import TaskConfig
 
 # brax is imported after brax_env, which keeps it from printing.
 from brax import envs  # isort: skip
@@ -45,13 +45,13 @@ class Args:
     steps: int = 2_000_000
     """Environment steps."""
     reports: int = 10
-    """How often the policy is judged."""
+    """How often the policy is evaluated."""
     seed: int = 0
     """Seed of the training."""
     min_angle_deg: float = 80.0
     """Smallest initial deviation in training [deg]."""
     cases: int = 1000
-    """Monte Carlo cases (80 to 180 deg) of each judgement."""
+    """Monte Carlo cases (80 to 180 deg) of each evaluation."""
 
 
 @contextlib.contextmanager
@@ -174,7 +174,7 @@ def main(args: Args) -> None:
     start = time.perf_counter()
 
     def report(step: int, updates: int, policy: MlpController) -> None:
-        summary = judge(policy, TaskConfig(), args.cases)
+        summary = evaluate(policy, TaskConfig(), args.cases)
         print(
             f"{step:>9} steps, {updates:>6} updates, {time.perf_counter() - start:5.0f} s: reward"
             f" {summary.mean_reward:8.1f}, success {summary.success_rate:.1%}, not settled"

@@ -6,13 +6,14 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from koz_jax import evaluation, observation
-from koz_jax.controllers.base import Memoryless
-from koz_jax.env import EnvParams, EnvState
-from koz_jax.evaluation import MonteCarloConfig
-from koz_jax.layout import ACTION_SIZE
-from koz_jax.summary import Summary, summarise
-from koz_jax.task_config import TaskConfig
+from koz_jax.config.monte_carlo import MonteCarloConfig
+from koz_jax.config.task import TaskConfig
+from koz_jax.control.base import Memoryless
+from koz_jax.evaluation.cases import fly_cases
+from koz_jax.evaluation.summary import Summary, summarise
+from koz_jax.task import observation
+from koz_jax.task.observation_layout import ACTION_SIZE
+from koz_jax.task.state import EnvState, Model
 
 # Scenarios by which policies are compared while they learn; no training and no final table draws them.
 _EVAL_SEED = 3_141_592_653
@@ -34,11 +35,11 @@ class MlpController(Memoryless):
             hidden = self.activation(hidden @ weight + bias)
         return jnp.tanh(hidden @ self.weights[-1] + self.biases[-1])[:ACTION_SIZE]
 
-    def decide(self, state: EnvState, params: EnvParams, memory: None) -> tuple[jax.Array, None]:
+    def decide(self, state: EnvState, model: Model, memory: None) -> tuple[jax.Array, None]:
         """Action (3,) in [-1, 1] for the state, by its observation."""
-        return self.act(observation.observe(state, params)), memory
+        return self.act(observation.observe(state)), memory
 
 
-def judge(controller: MlpController, task_config: TaskConfig, cases: int, seed: int = _EVAL_SEED) -> Summary:
+def evaluate(controller: MlpController, task: TaskConfig, cases: int, seed: int = _EVAL_SEED) -> Summary:
     """Fly the Monte Carlo of the paper (80 to 180 deg)."""
-    return summarise(evaluation.fly_cases(controller, task_config, MonteCarloConfig(cases=cases, seed=seed)))
+    return summarise(fly_cases(controller, task, MonteCarloConfig(cases=cases, seed=seed)))

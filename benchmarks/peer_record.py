@@ -5,11 +5,11 @@ import math
 import time
 from collections.abc import Sequence
 
-from mlp import MlpController, judge
+from mlp import MlpController, evaluate
 
-from koz_jax.settings import Settings
-from koz_jax.summary import Summary
-from koz_jax.task_config import TaskConfig
+from koz_jax.config.base import Settings
+from koz_jax.config.task import TaskConfig
+from koz_jax.evaluation.summary import Summary
 
 TARGETS = (0.5, 0.9, 0.95, 0.99)
 
@@ -69,7 +69,7 @@ class OutOfTimeError(Exception):
 
 
 class Recorder:
-    """Judges a policy now and then, with a clock that stands still meanwhile."""
+    """Evaluates a policy now and then, with a clock that stands still meanwhile."""
 
     def __init__(self, minutes: float, every_s: float = 15.0, cases: int = 1000) -> None:
         """Start the clock."""
@@ -79,29 +79,29 @@ class Recorder:
         self._every_s = every_s
         self._cases = cases
         self._score = (-math.inf, -math.inf)
-        self._judging_s = 0.0
+        self._evaluating_s = 0.0
         self._start = time.perf_counter()
 
     @property
     def seconds(self) -> float:
         """Training time so far [s]."""
-        return time.perf_counter() - self._start - self._judging_s
+        return time.perf_counter() - self._start - self._evaluating_s
 
     @property
     def due(self) -> bool:
-        """Whether it is time to judge again."""
+        """Whether it is time to evaluate again."""
         last = self.points[-1].seconds if self.points else 0.0
         return self.seconds >= min(last + self._every_s, self._limit_s)
 
     def record(self, env_steps: int, updates: int, controller: MlpController) -> None:
-        """Judge a policy and keep the best.
+        """Evaluate a policy and keep the best.
 
         Raises:
             OutOfTimeError: the training time is spent.
 
         """
         seconds, paused = self.seconds, time.perf_counter()
-        summary = judge(controller, TaskConfig(), self._cases)
+        summary = evaluate(controller, TaskConfig(), self._cases)
         score = (summary.success_rate, summary.mean_reward)
         if score > self._score:
             self._score, self.best = score, controller
@@ -117,7 +117,7 @@ class Recorder:
         print(
             f"  {seconds:5.0f} s, {updates} updates: {summary.success_rate:.1%}, {summary.mean_reward:.0f}", flush=True
         )
-        self._judging_s += time.perf_counter() - paused
+        self._evaluating_s += time.perf_counter() - paused
         if seconds >= self._limit_s:
             raise OutOfTimeError
 

@@ -2,8 +2,8 @@
 
 from peer_record import TARGETS, PeerResult
 
-from koz_jax.settings import Settings
-from koz_jax.summary import PAPER_TABLE
+from koz_jax.config.base import Settings
+from koz_jax.evaluation.summary import PAPER_TABLE
 
 _INTRO = """# Peers
 
@@ -13,10 +13,10 @@ keeps its result of before. Numbers behind it: [`peers.json`](peers.json).
 
 Every peer trains on deviations of 80 to 180 deg with the paper's reward and observation, with networks of 256-256 and
 batches of 256, through its best wrapper of the environment. Beyond that it has the settings of the table, mostly its
-own defaults; nobody tuned them for this task, as ours were. Ours is `train.py --preset fast` as it stands.
+own defaults; nobody tuned them for this task, as ours were. Ours is `koz train --preset fast` as it stands.
 
-The clock of a peer begins before the first step and stands still while it is judged. Ours begins with the process and
-counts imports, compilation and its own evaluations. Success is settled and no zone entered, in 1,000 cases that no
+The clock of a peer begins before the first step and stands still while it is evaluated. Ours begins with the process
+and counts imports, compilation and its own evaluations. Success is settled and no zone entered, in 1,000 cases that no
 training draws; time to a success rate is the time of the first evaluation that shows it.
 """
 
@@ -121,7 +121,7 @@ def markdown(report: Report) -> str:
         _bound(report),
         "## Monte Carlo after the training\n\n" + _monte_carlo(report),
         "\\* settled cases only. Of each peer the best policy by its evaluations, in"
-        f" {max((result.cases for result in report.results), default=0):,} cases, seed 0 of `eval_mc.py`.",
+        f" {max((result.cases for result in report.results), default=0):,} cases, seed 0 of `koz evaluate`.",
         "## Settings\n\n" + _settings(report),
         "The load average counts all processes of the machine; above the number of its cores, timings suffer.",
         "## Environment\n\n" + _table(environment),

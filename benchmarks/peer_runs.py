@@ -22,13 +22,16 @@ from flax import linen
 from mlp import MlpController
 from peer_record import OutOfTimeError, Point, Recorder, rate
 
-from koz_jax import evaluation, load_agent, observation, training
-from koz_jax.config import NetworkConfig
-from koz_jax.controllers.base import Controller
-from koz_jax.evaluation import MonteCarloConfig
-from koz_jax.presets import preset
-from koz_jax.sb3_env import ReorientationVecEnv
-from koz_jax.summary import Summary, summarise
+from koz_jax import load_agent
+from koz_jax.adapters.sb3_env import ReorientationVecEnv
+from koz_jax.config.monte_carlo import MonteCarloConfig
+from koz_jax.config.presets import preset
+from koz_jax.config.training import NetworkConfig
+from koz_jax.control.base import Controller
+from koz_jax.evaluation.cases import fly_cases
+from koz_jax.evaluation.summary import Summary, summarise
+from koz_jax.learning import train_step
+from koz_jax.task import observation_layout
 
 ENVS, UPDATES = 64, 8  # environments, and updates per step of all of them, for the off-policy peers
 _FOREVER = 10**9  # environment steps
@@ -46,7 +49,7 @@ class Run:
 
 
 def _plain_mlp(weights: list[Any], biases: list[Any]) -> MlpController:
-    zeros = jnp.zeros(observation.SIZE)
+    zeros = jnp.zeros(observation_layout.SIZE)
     arrays = [tuple(jnp.asarray(leaf) for leaf in leaves) for leaves in (weights, biases)]
     return MlpController(zeros, zeros + 1.0, arrays[0], arrays[1], linen.relu)
 
@@ -175,11 +178,11 @@ def _our_update_rate(steps: int = 100, stretches: int = 10) -> float:
     """Updates per second of our training loop with the paper's networks and batch, in the best stretch."""
     fast = preset("fast")
     config = fast.model_copy(update={"network": NetworkConfig(hidden_sizes=(256, 256))})
-    state = training.init(config, jax.random.key(0))
+    state = train_step.init(config, jax.random.key(0))
     rates = []
     for _ in range(stretches):
         start = time.perf_counter()
-        state, _ = jax.block_until_ready(training.train_chunk(config, state, jnp.int32(steps)))
+        state, _ = jax.block_until_ready(train_step.train_chunk(config, state, jnp.int32(steps)))
         rates.append(steps * config.updates_per_step / (time.perf_counter() - start))
     return max(rates)
 
@@ -197,5 +200,4 @@ RUNS: dict[str, Callable[[float], Run]] = {
 
 def final_table(controller: Controller, cases: int) -> Summary:
     """The Monte Carlo of the paper, seed 0."""
-    task_config = preset("fast").task
-    return summarise(evaluation.fly_cases(controller, task_config, MonteCarloConfig(cases=cases)))
+    return summarise(fly_cases(controller, preset("fast").task, MonteCarloConfig(cases=cases)))

@@ -18,7 +18,7 @@ import tyro
 from peer_record import PeerResult, rows
 from peer_report import Report, markdown
 
-from koz_jax import storage
+from koz_jax.storage import files
 
 NAMES = ("koz_jax", "SB3 SAC", "SBX SAC", "brax SAC", "brax PPO", "SB3 TD3", "SB3 DDPG")
 
@@ -91,8 +91,8 @@ def main(args: Args) -> None:
         print(name, flush=True)
         found = {result.name: result for result in report.results} | {name: in_process(name, args)}
         report = report.model_copy(update={"results": tuple(found[peer] for peer in NAMES if peer in found)})
-        storage.write_text(saved, json.dumps(report.model_dump(mode="json"), indent=1) + "\n")
-    storage.write_text(args.out / "peers.md", markdown(report))
+        files.write_text(saved, json.dumps(report.model_dump(mode="json"), indent=1) + "\n")
+    files.write_text(args.out / "peers.md", markdown(report))
 
 
 if __name__ == "__main__":

@@ -72,7 +72,7 @@ def measure(worker: Worker) -> Times:
     # each other, 4 ms for every array.
     os.sched_setaffinity(0, cores[: worker.layout.cores])
     os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={worker.layout.devices}"
-    from koz_jax import runtime
+    from koz_jax.storage import runtime
 
     runtime.keep_programs()
     if worker.layout.processes > 1:
@@ -81,31 +81,34 @@ def measure(worker: Worker) -> Times:
     import jax
     import numpy as np
 
-    from koz_jax import evaluation, processes, sharding, training
-    from koz_jax.agent import load_agent
-    from koz_jax.evaluation import MonteCarloConfig
-    from koz_jax.presets import preset
+    from koz_jax.agents.agent import load_agent
+    from koz_jax.config.monte_carlo import MonteCarloConfig
+    from koz_jax.config.presets import preset
+    from koz_jax.evaluation import cases
+    from koz_jax.learning import train_step
+    from koz_jax.runs import sharding
+    from koz_jax.storage import processes
 
     def begin() -> None:
-        processes.any_of(False)
+        processes.any_process(False)
 
     agent = load_agent("phase2")
     share = CASES // worker.layout.processes
-    cases = MonteCarloConfig(share, first=share * worker.process)
-    monte_carlo = best_seconds(lambda: evaluation.fly_cases(agent.controller, agent.task, cases), begin)
+    drawn = MonteCarloConfig(cases=share, first=share * worker.process)
+    monte_carlo = best_seconds(lambda: cases.fly_cases(agent.controller, agent.task, drawn), begin)
 
     def training_step(num_envs: int, more: int) -> float:
         fast = preset("fast")
         config = fast.model_copy(
             update={"num_envs": num_envs, "updates_per_step": more * fast.updates_per_step, "prefill_steps": 20}
         )
-        state = sharding.place(training.init(config, jax.random.key(0)), worker.layout.devices)
+        state = sharding.place(train_step.init(config, jax.random.key(0)), worker.layout.devices)
 
         def chunk() -> None:
             nonlocal state
             state = sharding.place(state, worker.layout.devices)
-            trained = training.train_chunk(config, state, np.int32(STEPS))  # pyright: ignore[reportArgumentType]
-            state, _ = processes.finished(trained)
+            trained = train_step.train_chunk(config, state, np.int32(STEPS))  # pyright: ignore[reportArgumentType]
+            state, _ = processes.wait_for_devices(trained)
 
         return best_seconds(chunk, begin) / STEPS
 

@@ -19,14 +19,21 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from koz_jax import env, evaluation, observation, reward, runtime, scenario, task, training
-from koz_jax.agent import Agent, PolicyController, Provenance, policy_network
-from koz_jax.config import NetworkConfig
-from koz_jax.evaluation import MonteCarloConfig
-from koz_jax.presets import preset
+from koz_jax.agents.agent import Agent
+from koz_jax.agents.record import Provenance
+from koz_jax.config.monte_carlo import MonteCarloConfig
+from koz_jax.config.presets import preset
+from koz_jax.config.task import TaskConfig
+from koz_jax.config.training import NetworkConfig
+from koz_jax.control.policy import PolicyController, policy_network
+from koz_jax.evaluation.monte_carlo import run_cases
+from koz_jax.learning import train_step
 from koz_jax.sac import learner
 from koz_jax.sac.losses import Batch
-from koz_jax.task_config import TaskConfig
+from koz_jax.storage import runtime
+from koz_jax.task import observation_layout, reward
+from koz_jax.task.environment import Reorientation
+from koz_jax.task.state import EnvState
 
 CASES = 10_000
 UPDATES = 200
@@ -78,9 +85,9 @@ def machine_rate() -> float:
 def monte_carlo(hidden: int, rate: float) -> None:
     """One call over all cases with an untrained policy: its speed does not depend on its weights."""
     network = NetworkConfig(hidden_sizes=(hidden, hidden))
-    policy = policy_network(network).init(jax.random.key(0), jnp.zeros(observation.SIZE))
+    policy = policy_network(network).init(jax.random.key(0), jnp.zeros(observation_layout.SIZE))
     agent = Agent(PolicyController(policy, network), TaskConfig(), Provenance(), f"{hidden}-{hidden}")
-    flown = [evaluation.run_cases(agent, agent.task, MonteCarloConfig(CASES)) for _ in range(3)]
+    flown = [run_cases(agent, agent.task, MonteCarloConfig(cases=CASES), progress=False) for _ in range(3)]
     seconds = min(run.wall_s for run in flown)
     steps = CASES * agent.task.episode_steps
     work = steps * sum(flops((1, *leaf.shape)) for leaf in jax.tree.leaves(policy) if leaf.ndim == 2)
@@ -93,24 +100,21 @@ def monte_carlo(hidden: int, rate: float) -> None:
 
 def environment(num_envs: int = 1024, steps: int = 1000) -> None:
     """Physics and paper reward, with and without the observation."""
-    params = task.env_params(TaskConfig())
-    ranges = task.scenario_ranges(TaskConfig().scenario, 80.0, 180.0)
-    keys = jax.random.split(jax.random.key(0), num_envs)
-    drawn = jax.vmap(lambda key: scenario.sample(key, ranges, params.spacecraft.boresight_B))(keys)
-    states = jax.vmap(env.reset)(drawn)
+    env = Reorientation.from_config()
+    states = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), num_envs))
     action = jnp.full((num_envs, 3), 0.1)
 
     def run(observe: bool) -> Callable[[], jax.Array]:
         @jax.jit
-        def loop(states: env.EnvState) -> jax.Array:
-            def body(carry: tuple[env.EnvState, jax.Array], _: None) -> tuple[tuple[env.EnvState, jax.Array], None]:
+        def loop(states: EnvState) -> jax.Array:
+            def body(carry: tuple[EnvState, jax.Array], _: None) -> tuple[tuple[EnvState, jax.Array], None]:
                 states, total = carry
-                states, outcome = jax.vmap(env.step, in_axes=(0, 0, None))(states, action, params)
-                terms = reward.terms(outcome, params.reward, params.spacecraft.torque_limit)
-                total += reward.total(terms, reward.PAPER_WEIGHTS)
+                # What is not asked for, the compiler leaves out.
+                stepped = jax.vmap(env.step)(states, action)
+                total += jax.vmap(reward.total, in_axes=(0, None))(stepped.terms, reward.PAPER_WEIGHTS)
                 if observe:
-                    total += jnp.sum(jax.vmap(observation.observe, in_axes=(0, None))(states, params), axis=1)
-                return (states, total), None
+                    total += jnp.sum(stepped.observation, axis=1)
+                return (stepped.state, total), None
 
             return jax.lax.scan(body, (states, jnp.zeros(num_envs)), None, length=steps)[0][1]
 
@@ -203,8 +207,8 @@ def main() -> None:
         monte_carlo(hidden, rate)
     environment()
     paper, fast = preset("paper"), preset("fast")
-    update("paper (256-256, batch 256)", training.make_sac(paper), paper.sac.batch_size, rate)
-    update("fast (128-128, batch 256)", training.make_sac(fast), fast.sac.batch_size, rate)
+    update("paper (256-256, batch 256)", train_step.make_sac(paper), paper.sac.batch_size, rate)
+    update("fast (128-128, batch 256)", train_step.make_sac(fast), fast.sac.batch_size, rate)
     first_update()
 
 

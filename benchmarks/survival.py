@@ -20,13 +20,11 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
-import bad_settings  # noqa: E402
-import corruption  # noqa: E402
-import faults  # noqa: E402
 import numpy as np  # noqa: E402
-from tiny import CONFIG, FLAGS  # noqa: E402
+from support import bad_settings, corruption, faults  # noqa: E402
+from support.tiny import CONFIG, FLAGS  # noqa: E402
 
-from koz_jax.run_folder import RunFolder  # noqa: E402
+from koz_jax.runs.folder import RunFolder  # noqa: E402
 
 # An accepted command line may ask for more work than anybody waits for; it is then asked to stop.
 _RUN_S = 90.0

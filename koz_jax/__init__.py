@@ -7,53 +7,77 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from koz_jax.agent import Agent, load_agent, shipped_agents
-    from koz_jax.config import TrainConfig
-    from koz_jax.errors import UserError
-    from koz_jax.evaluation import MonteCarlo, fly_case, fly_scenario, monte_carlo
-    from koz_jax.numpy_policy import load_policy
-    from koz_jax.presets import preset
-    from koz_jax.summary import summarise, table
-    from koz_jax.trainer import train
+    from koz_jax.agents.agent import Agent as Agent
+    from koz_jax.agents.agent import load_agent as load_agent
+    from koz_jax.agents.numpy_policy import load_policy as load_policy
+    from koz_jax.agents.record import shipped_agents as shipped_agents
+    from koz_jax.config.monte_carlo import MonteCarloConfig as MonteCarloConfig
+    from koz_jax.config.presets import preset as preset
+    from koz_jax.config.shield import ShieldConfig as ShieldConfig
+    from koz_jax.config.shield import UncertaintyConfig as UncertaintyConfig
+    from koz_jax.config.task import ScenarioConfig as ScenarioConfig
+    from koz_jax.config.task import SpacecraftConfig as SpacecraftConfig
+    from koz_jax.config.task import TaskConfig as TaskConfig
+    from koz_jax.config.training import TrainConfig as TrainConfig
+    from koz_jax.control.registry import load_controller as load_controller
+    from koz_jax.errors import DamagedFileError as DamagedFileError
+    from koz_jax.errors import KozError as KozError
+    from koz_jax.errors import MissingExtraError as MissingExtraError
+    from koz_jax.errors import SettingsError as SettingsError
+    from koz_jax.errors import StorageError as StorageError
+    from koz_jax.evaluation.cases import fly_case as fly_case
+    from koz_jax.evaluation.cases import fly_scenario as fly_scenario
+    from koz_jax.evaluation.monte_carlo import MonteCarlo as MonteCarlo
+    from koz_jax.evaluation.monte_carlo import monte_carlo as monte_carlo
+    from koz_jax.evaluation.summary import summarise as summarise
+    from koz_jax.evaluation.summary import table as table
+    from koz_jax.runs.trainer import train as train
+    from koz_jax.task.environment import Reorientation as Reorientation
 
-__version__ = "0.1.0"
+    __version__: str
 
-__all__ = [
-    "Agent",
-    "MonteCarlo",
-    "TrainConfig",
-    "UserError",
-    "fly_case",
-    "fly_scenario",
-    "load_agent",
-    "load_policy",
-    "monte_carlo",
-    "preset",
-    "shipped_agents",
-    "summarise",
-    "table",
-    "train",
-]
-
+# Where the public names are.
 _HOME = {
-    "Agent": "agent",
-    "load_agent": "agent",
-    "shipped_agents": "agent",
-    "TrainConfig": "config",
-    "UserError": "errors",
-    "MonteCarlo": "evaluation",
-    "fly_case": "evaluation",
-    "fly_scenario": "evaluation",
-    "monte_carlo": "evaluation",
-    "load_policy": "numpy_policy",
-    "preset": "presets",
-    "summarise": "summary",
-    "table": "summary",
-    "train": "trainer",
+    "Reorientation": "task.environment",
+    "TaskConfig": "config.task",
+    "SpacecraftConfig": "config.task",
+    "ScenarioConfig": "config.task",
+    "ShieldConfig": "config.shield",
+    "UncertaintyConfig": "config.shield",
+    "MonteCarloConfig": "config.monte_carlo",
+    "TrainConfig": "config.training",
+    "preset": "config.presets",
+    "train": "runs.trainer",
+    "Agent": "agents.agent",
+    "load_agent": "agents.agent",
+    "load_policy": "agents.numpy_policy",
+    "shipped_agents": "agents.record",
+    "load_controller": "control.registry",
+    "monte_carlo": "evaluation.monte_carlo",
+    "MonteCarlo": "evaluation.monte_carlo",
+    "fly_case": "evaluation.cases",
+    "fly_scenario": "evaluation.cases",
+    "summarise": "evaluation.summary",
+    "table": "evaluation.summary",
+    "KozError": "errors",
+    "SettingsError": "errors",
+    "StorageError": "errors",
+    "DamagedFileError": "errors",
+    "MissingExtraError": "errors",
 }
+
+__all__ = [*_HOME]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from koz_jax.config.version import version
+
+        return version()
     if name not in _HOME:
         raise AttributeError(f"module 'koz_jax' has no attribute {name!r}")
     return getattr(importlib.import_module(f"koz_jax.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOME, "__version__"})

@@ -1,22 +1,44 @@
-"""Errors that a user can act on, and how the command lines show them: a line each, without a traceback."""
+"""Errors that a user can act on: the message names what was given, its value, and what is allowed."""
 
-import os
 import reprlib
-import sys
-from collections.abc import Callable
 
 from pydantic import ValidationError
 
 
-class UserError(ValueError):
-    """Something the user gave cannot be used; the message names it, its value, and what is allowed."""
+class KozError(Exception):
+    """Base of all errors of this package that a user can act on."""
 
-    agreed = False  # whether all of several processes end with it (see ``processes.raise_together``)
+    ends_all_processes = False  # whether all of several processes end with it, see ``storage.processes.raise_in_all``
 
 
-def warn(text: str) -> None:
-    """Say on stderr what went wrong without ending the work."""
-    print(f"warning: {text}", file=sys.stderr, flush=True)
+class SettingsError(KozError, ValueError):
+    """A setting, an argument or an input cannot be used."""
+
+
+class StorageError(KozError, OSError):
+    """A file cannot be found, read or written."""
+
+
+class DamagedFileError(StorageError):
+    """A file is there, but does not hold what was once written."""
+
+
+class MissingExtraError(KozError, ImportError):
+    """An optional package is not installed."""
+
+
+class PeerProcessError(KozError, RuntimeError):
+    """Another one of several processes has failed, has ended, or does not answer."""
+
+
+class DivergenceError(KozError, ArithmeticError):
+    """Training came to numbers that are not finite."""
+
+
+def missing_extra(error: ImportError, package: str, extra: str) -> MissingExtraError:
+    """Say what to install when the import of an optional package failed.  extra: the one that brings the package."""
+    found = (error.name or package).split(".")[0]
+    return MissingExtraError(f"{found}: cannot be imported; install it with: pip install 'koz_jax[{extra}]' ({error})")
 
 
 def explain(error: ValidationError) -> str:
@@ -29,35 +51,3 @@ def explain(error: ValidationError) -> str:
         value = "" if isinstance(problem["input"], dict) or not name else f" (got {reprlib.repr(problem['input'])})"
         lines.append(f"{name}: {message}{value}" if name else message)
     return "\n".join(lines)
-
-
-def exit_status(command: Callable[[], int]) -> int:
-    """Run a command line.  Returns its exit status; as in a shell, 130 after Ctrl-C and 141 when nobody reads on."""
-    try:
-        return command()
-    except (ValidationError, UserError) as error:
-        message = explain(error) if isinstance(error, ValidationError) else str(error)
-        print("\n".join(f"error: {line}" for line in message.splitlines()), file=sys.stderr)
-        if isinstance(error, UserError) and error.agreed:
-            return 2
-        return _alone(2)
-    except BrokenPipeError:
-        # The reader of the output has left (``train.py --help | head``); nor may Python's last flush complain.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return _alone(141)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return _alone(130)
-
-
-def _alone(status: int) -> int:
-    """Return a status that this process ends with alone; if it is one of several (``runtime.join``), end at once.
-
-    The others may be waiting for it, and at the end of Python it would wait for them.
-    """
-    jax = sys.modules.get("jax")
-    if jax is not None and jax.distributed.is_initialized():
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status)
-    return status

@@ -14,21 +14,23 @@ import matplotlib.pyplot as plt
 import numpy as np
 from IPython.display import display
 
-from koz_jax import curriculum, dynamics, env, fly_scenario, load_agent, preset, reward, scenario, task
-from koz_jax.dynamics import RigidBodyState
+from koz_jax import Reorientation, TaskConfig, fly_scenario, load_agent, preset
 from koz_jax.figures import sphere
-from koz_jax.observation import LAYOUT, SLICES
-from koz_jax.task_config import TaskConfig
+from koz_jax.learning import curriculum
+from koz_jax.task import dynamics, reward, scenario
+from koz_jax.task.dynamics import RigidBodyState
+from koz_jax.task.observation_layout import LAYOUT, SLICES
 
 plt.rcParams |= {"figure.figsize": (8, 3), "figure.dpi": 80, "axes.grid": True, "grid.alpha": 0.4}
 
 # %% [markdown]
-# Every number of the task is a setting, validated once and in degrees; `env_params` turns it into traced arrays.
+# Every number of the task is a setting, validated once and in degrees; `Reorientation` is the environment made of them,
+# in traced arrays and radians.
 
 # %%
-task_config = TaskConfig()
-params = task.env_params(task_config)
-print(task_config.model_dump_json(indent=1, include={"spacecraft", "scenario"}))
+task = TaskConfig()
+env = Reorientation.from_config(task)
+print(task.model_dump_json(indent=1, include={"spacecraft", "scenario"}))
 
 # %% [markdown]
 # ## Dynamics
@@ -41,16 +43,16 @@ tumbling = RigidBodyState(q_BN=jnp.array([1.0, 0.0, 0.0, 0.0]), omega_BN_B=jnp.a
 
 def advance(body, _):
     """One step without torque, and the state it began in."""
-    return dynamics.step(body, jnp.zeros(3), params.spacecraft, params.dt), body
+    return dynamics.step(body, jnp.zeros(3), env.model.inertia_B, env.model.dt), body
 
 
 _, bodies = jax.lax.scan(advance, tumbling, None, length=1000)
-inertia = np.asarray(params.spacecraft.inertia_B)
+inertia = np.asarray(env.model.inertia_B)
 momentum = np.linalg.norm(bodies.omega_BN_B @ inertia, axis=1)
 energy = 0.5 * np.einsum("ti,ij,tj->t", bodies.omega_BN_B, inertia, bodies.omega_BN_B)
 
 figure, (left, right) = plt.subplots(1, 2, layout="constrained")
-seconds = np.arange(1000) * task_config.step_seconds
+seconds = np.arange(1000) * task.step_seconds
 left.plot(seconds, bodies.omega_BN_B, label=["x", "y", "z"])
 left.set(xlabel="time [s]", ylabel="rate [rad/s]")
 left.margins(y=0.2)
@@ -69,7 +71,7 @@ plt.show()
 # %%
 drawn = scenario.paper_test()
 flights = {name: fly_scenario(load_agent(name), drawn) for name in ("phase1", "phase2")}
-seconds = np.arange(task_config.episode_steps + 1) * task_config.step_seconds
+seconds = np.arange(task.episode_steps + 1) * task.step_seconds
 for name, (history, _) in flights.items():
     plt.plot(seconds, np.rad2deg(history.zone_margin), label=name)
 plt.axhline(0.0, color="black", linewidth=1)
@@ -79,7 +81,7 @@ plt.show()
 
 # %%
 history, result = flights["phase2"]
-picture = sphere.draw(history, task_config, "phase2 on the paper's test scenario")
+picture = sphere.draw(history, task, "phase2 on the paper's test scenario")
 picture.set_dpi(70)
 display(picture)
 
@@ -88,18 +90,19 @@ display(picture)
 # Sixteen numbers, declared once; everything that needs their order takes it from `SLICES`.
 
 # %%
+start = env.reset(drawn)
+observed = np.asarray(env.observe(start))
 for name in LAYOUT:
-    print(f"{name:17}", np.array2string(np.asarray(history.observation[0, SLICES[name]]), precision=4))
+    print(f"{name:17}", np.array2string(observed[SLICES[name]], precision=4))
 
 # %% [markdown]
 # ## The reward, term by term
-# A history holds all states, so the outcome of every step, and from it every term of the reward, is one `vmap` away.
+# A history holds all states, so every step can be taken again, with every term of the reward, in one `vmap`.
 
 # %%
 states = jax.tree.map(lambda leaf: leaf[:-1], history.state)
-actions = history.torque_B[:-1] / params.spacecraft.torque_limit
-_, outcomes = jax.vmap(env.step, in_axes=(0, 0, None))(states, actions, params)
-terms = jax.vmap(reward.terms, in_axes=(0, None, None))(outcomes, params.reward, params.spacecraft.torque_limit)
+actions = history.torque_B[:-1] / env.nominal_limits.box_B
+terms = jax.vmap(env.step)(states, actions).terms
 
 figure, (upper, lower) = plt.subplots(2, 1, figsize=(8, 4.5), layout="constrained", sharex=True)
 for name, values in vars(terms).items():

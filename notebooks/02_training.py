@@ -2,7 +2,7 @@
 # # 2. Training
 #
 # An agent learns the maneuver in two or three minutes on two CPU cores: first turning (phase 1), then turning around
-# the zone (phase 2), then a polish by gradients through the dynamics. `python train.py` does the same with more of
+# the zone (phase 2), then a polish by gradients through the dynamics. `koz train` does the same with more of
 # everything.
 
 # %%
@@ -13,8 +13,10 @@ from pathlib import Path
 import numpy as np
 from IPython.display import display
 
-from koz_jax import TrainConfig, fly_scenario, monte_carlo, preset, runtime, scenario, summarise, table, train
+from koz_jax import TrainConfig, fly_scenario, monte_carlo, preset, summarise, table, train
 from koz_jax.figures import learning, sphere
+from koz_jax.storage import runtime
+from koz_jax.task import scenario
 
 runtime.configure()  # all cores; compiled programs are kept for the next time
 small = os.environ.get("KOZ_JAX_BUDGET") == "small"
@@ -46,8 +48,7 @@ print(*sorted(str(path.relative_to(run)) for path in run.glob("*")), sep="\n")
 
 # %% [markdown]
 # ## Watch it learn
-# `metrics.csv` has a row per logged chunk. `python -m koz_jax.figures.learning RUN [RUN ...]` draws the same figure of
-# one or several runs.
+# `metrics.csv` has a row per logged chunk. `koz curves RUN [RUN ...]` draws the same figure of one or several runs.
 
 # %%
 picture = learning.draw(learning.curves([learning.read_metrics(run)]))

@@ -12,13 +12,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 from IPython.display import display
 
-from koz_jax import fly_case, load_agent, monte_carlo, runtime, summarise, table
-from koz_jax.evaluation import draw_case
+from koz_jax import fly_case, load_agent, monte_carlo, summarise, table
+from koz_jax.evaluation.cases import draw_case
+from koz_jax.evaluation.tables import describe_case
 from koz_jax.figures import monte_carlo as figures
 from koz_jax.figures import sphere
-from koz_jax.replay.maneuver import fly
-from koz_jax.replay.page import write_replay
-from koz_jax.tables import describe_case
+from koz_jax.storage import runtime
+from koz_jax.viewer.maneuver import fly
+from koz_jax.viewer.page import write_page
 
 runtime.configure()  # all cores; compiled programs are kept for the next time
 plt.rcParams |= {"figure.figsize": (8, 3), "figure.dpi": 80, "axes.grid": True, "grid.alpha": 0.4}
@@ -32,7 +33,7 @@ print(f"compiled in {flown.compile_s:.1f} s, flown in {flown.wall_s:.1f} s")
 
 # %% [markdown]
 # ## All cases at a glance
-# `python eval_mc.py --figures DIR` writes this figure of the paper, and the others, for print.
+# `koz evaluate --figures DIR` writes this figure of the paper, and the others, for print.
 
 # %%
 results = flown.results
@@ -74,13 +75,13 @@ picture.set_dpi(70)
 display(picture)
 
 # %% [markdown]
-# ## Replay
+# ## In 3-D
 # The same case as an interactive page, beside the agent that knows no zone: one file, which opens in a browser without
-# any network. `python -m koz_jax.replay --case N` writes the same.
+# any network. `koz view --case N` writes the same.
 
 # %%
-drawn = draw_case(agent.task, flown.config, worst[0])
+drawn = draw_case(agent.task, flown.config, int(worst[0]))
 maneuvers = [fly(load_agent("phase1"), drawn), fly(agent, drawn)]
 page = Path("runs", "worst.html")
-write_replay(page, maneuvers, f"Case {worst[0]}, the worst of {flown.config.cases}")
+write_page(page, maneuvers, f"Case {worst[0]}, the worst of {flown.config.cases}")
 print(f"{page}: {page.stat().st_size / 1e6:.1f} MB")

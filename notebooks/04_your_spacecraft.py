@@ -13,9 +13,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from IPython.display import display
 
-from koz_jax import TrainConfig, fly_case, load_agent, monte_carlo, preset, runtime, summarise, table, train
+from koz_jax import TaskConfig, TrainConfig, fly_case, load_agent, monte_carlo, preset, summarise, table, train
 from koz_jax.figures import sphere
-from koz_jax.task_config import TaskConfig
+from koz_jax.storage import runtime
 
 runtime.configure()  # all cores; compiled programs are kept for the next time
 small = os.environ.get("KOZ_JAX_BUDGET") == "small"
@@ -48,7 +48,7 @@ except ValueError as error:
 
 # %%
 cases = 500 if small else 2_000
-before = monte_carlo(load_agent("phase2"), cases=cases, task_config=mine)
+before = monte_carlo(load_agent("phase2"), cases=cases, task=mine)
 print(table(summarise(before.results), cases, "phase2 on my spacecraft"))
 
 # %% [markdown]
@@ -86,5 +86,5 @@ picture.set_dpi(70)
 display(picture)
 
 # %% [markdown]
-# `agent.save("my-agent")` keeps it as a folder; `load_agent("my-agent")`, `eval_mc.py --agent my-agent` and
-# `python -m koz_jax.replay --agent my-agent` take it from there.
+# `agent.save("my-agent")` keeps it as a folder; `load_agent("my-agent")`, `koz evaluate --agent my-agent` and
+# `koz view --agent my-agent` take it from there.

@@ -20,13 +20,18 @@ from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
 from nbformat import NotebookNode, validate, writes
 
-from koz_jax import runtime, storage
-from koz_jax.errors import UserError, exit_status
+from koz_jax.cli.exit_status import exit_status
+from koz_jax.errors import KozError, SettingsError
+from koz_jax.storage import files, runtime
 
 HERE = Path(__file__).resolve().parent
 # Small enough for a code host to show; most pictures are below half of it.
 LARGEST_PICTURE = 200_000  # bytes
 LARGEST_TEXT = 10_000  # characters
+
+
+class NotebookError(KozError):
+    """A notebook fails, or has an output that should not be kept."""
 
 
 def main(argv: list[str]) -> int:
@@ -43,9 +48,9 @@ def main(argv: list[str]) -> int:
 def _build(chosen: list[str], names: list[str], out: Path, jobs: int) -> int:
     for name in chosen:
         if name not in names:
-            raise UserError(f"notebooks: unknown notebook {name!r}; allowed: {', '.join(names)}")
+            raise SettingsError(f"notebooks: unknown notebook {name!r}; allowed: {', '.join(names)}")
     if jobs < 1:
-        raise UserError(f"jobs: must be 1 or more, got {jobs}")
+        raise SettingsError(f"jobs: must be 1 or more, got {jobs}")
     runtime.keep_programs()
     # The kernel of this environment, whatever others the user has.
     os.environ["JUPYTER_PREFER_ENV_PATH"] = "1"
@@ -53,7 +58,7 @@ def _build(chosen: list[str], names: list[str], out: Path, jobs: int) -> int:
     def build(name: str) -> None:
         start = time.perf_counter()
         notebook = execute(HERE / f"{name}.py")
-        storage.write_text(out / f"{name}.ipynb", writes(notebook) + "\n")
+        files.write_text(out / f"{name}.ipynb", writes(notebook) + "\n")
         print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
 
     begin = time.perf_counter()
@@ -67,7 +72,7 @@ def execute(source: Path) -> NotebookNode:
     """Run a notebook from top to bottom in a fresh process, in an empty folder.
 
     Raises:
-        UserError: a cell fails, or leaves too large an output or a figure without its picture.
+        NotebookError: a cell fails, or leaves too large an output or a figure without its picture.
 
     """
     notebook = jupytext.read(source)
@@ -85,7 +90,7 @@ def execute(source: Path) -> NotebookNode:
         try:
             client.execute()
         except (CellExecutionError, RuntimeError) as error:  # the latter where the kernel does not start, or dies
-            raise UserError(f"{source.name}: {error}") from None
+            raise NotebookError(f"{source.name}: {error}") from None
     for number, cell in enumerate(notebook.cells):
         cell.id = f"{number:02d}"  # Jupytext's are random, and would change with every build
         if cell.cell_type == "code":
@@ -108,11 +113,15 @@ def _is_kept(output: Any, name: str) -> bool:
 def _checked(output: Any, name: str) -> Any:
     data = output.get("data", {})
     if data.get("text/plain", "").startswith("<Figure") and "image/png" not in data:
-        raise UserError(f"{name}: a figure shows as {data['text/plain']}; begin the notebook with %matplotlib inline")
+        raise SettingsError(
+            f"{name}: a figure shows as {data['text/plain']}; begin the notebook with %matplotlib inline"
+        )
     picture = len(base64.b64decode(data.get("image/png", "")))
     text = len(str(output.get("text", "")))
     if picture > LARGEST_PICTURE or text > LARGEST_TEXT:
-        raise UserError(f"{name}: an output is too large: a picture of {picture} bytes, a text of {text} characters")
+        raise SettingsError(
+            f"{name}: an output is too large: a picture of {picture} bytes, a text of {text} characters"
+        )
     return output
 
 

@@ -1,14 +1,17 @@
 """What the tests share."""
 
+import os
 from collections.abc import Iterator
+
+# Numbers are compared with those of the CPU: also where a GPU is present, and in subprocesses.
+os.environ["JAX_PLATFORMS"] = os.environ.get("KOZ_JAX_TEST_PLATFORM", "cpu")
 
 import jax
 import pytest
 from hypothesis import settings
 
-from koz_jax import runtime, task
-from koz_jax.env import EnvParams
-from koz_jax.task_config import TaskConfig
+from koz_jax.storage import runtime
+from koz_jax.task.environment import Reorientation
 
 # For the other workers, for subprocesses, and for the next session.
 runtime.keep_programs()
@@ -26,6 +29,6 @@ def strict_shapes() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def params() -> EnvParams:
-    """The paper's spacecraft and reward, full-angle convention."""
-    return task.env_params(TaskConfig())
+def env() -> Reorientation:
+    """The paper's task: spacecraft, reward (full-angle convention), scenarios."""
+    return Reorientation.from_config()

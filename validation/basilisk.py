@@ -127,7 +127,7 @@ def compare_tumbles(data: dict[str, np.ndarray]) -> bool:
 
 
 def compare_cases(data: dict[str, np.ndarray], controller: CLibrary) -> bool:
-    """All cases under the exported controller, judged here."""
+    """All cases under the exported controller, with verdicts made here."""
     start = time.perf_counter()
     dt, steps = float(data["step_seconds"]), int(data["steps"])
     fleet = Fleet(data["q_BN"], data["omega_BN_B"], data["inertia"], dt)
@@ -149,10 +149,10 @@ def compare_cases(data: dict[str, np.ndarray], controller: CLibrary) -> bool:
         fleet.advance()
         effort += np.sum(torque_B.astype(float) ** 2, axis=1) * dt
     print(f"{len(half_angle)} cases in Basilisk: {time.perf_counter() - start:.0f} s")
-    return _judge(data, np.array(errors), np.array(margins), effort)
+    return _verdict(data, np.array(errors), np.array(margins), effort)
 
 
-def _judge(data: dict[str, np.ndarray], errors: np.ndarray, margins: np.ndarray, effort: np.ndarray) -> bool:
+def _verdict(data: dict[str, np.ndarray], errors: np.ndarray, margins: np.ndarray, effort: np.ndarray) -> bool:
     """errors, margins: (steps + 1, cases) [rad]; effort: (cases,) [N^2 m^2 s]."""
     outside = errors > data["settled_angle"]
     settled, violated = ~outside[-1], np.min(margins, axis=0) <= 0.0

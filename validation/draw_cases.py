@@ -1,4 +1,4 @@
-"""What an independent simulator needs: cases of eval_mc.py's draw, our verdicts on them, and the exported controller.
+"""What an independent simulator needs: cases of ``koz evaluate``, our verdicts, and the exported code.
 
     python validation/draw_cases.py --agent phase2 --cases 1000 --out build/basilisk
 
@@ -15,13 +15,16 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from koz_jax import dynamics, evaluation, runtime, storage
-from koz_jax.agent import Agent, load_agent
-from koz_jax.dynamics import RigidBodyState, Spacecraft
-from koz_jax.errors import exit_status
-from koz_jax.evaluation import MonteCarloConfig
-from koz_jax.export.__main__ import export, write_files
-from koz_jax.task_config import SpacecraftConfig, TaskConfig
+from koz_jax.agents.agent import Agent, load_agent
+from koz_jax.cli.exit_status import exit_status
+from koz_jax.config.base import checked
+from koz_jax.config.monte_carlo import MonteCarloConfig
+from koz_jax.config.task import TaskConfig
+from koz_jax.evaluation.cases import draw_case, fly_cases
+from koz_jax.export.files import export, write_files
+from koz_jax.storage import files, runtime
+from koz_jax.task import dynamics
+from koz_jax.task.dynamics import RigidBodyState
 
 _TUMBLES = 20
 _LARGEST_TUMBLE = 0.2  # [rad/s]
@@ -53,8 +56,8 @@ def main(argv: list[str]) -> int:
 
 
 def draw(args: DrawArgs) -> int:
-    config = MonteCarloConfig(args.cases, args.seed)
-    storage.make_folder("out", args.out)
+    config = checked(MonteCarloConfig, cases=args.cases, seed=args.seed)
+    files.make_folder("out", args.out)
     runtime.configure()
     agent = load_agent(args.agent)
     write_files(args.out, export(agent, "c"))
@@ -74,14 +77,14 @@ def draw(args: DrawArgs) -> int:
 def cases(agent: Agent, config: MonteCarloConfig) -> dict[str, np.ndarray]:
     """The scenarios and our verdicts by name; leading axis (cases,)."""
     indices = jnp.arange(config.cases)
-    drawn = jax.jit(jax.vmap(lambda case: evaluation.draw_case(agent.task, config, case)))(indices)
-    flown = evaluation.fly_cases(agent.controller, agent.task, config)
+    drawn = jax.jit(jax.vmap(lambda case: draw_case(agent.task, config, case)))(indices)
+    flown = fly_cases(agent.controller, agent.task, config)
     return {
         "q_BN": np.asarray(drawn.initial.q_BN),
         "omega_BN_B": np.asarray(drawn.initial.omega_BN_B),
         "q_DN": np.asarray(drawn.q_DN),
-        "zone_axis_N": np.asarray(drawn.zones.axis_N),
-        "zone_half_angle": np.asarray(drawn.zones.half_angle),
+        "zone_axis_N": np.asarray(drawn.constraints.axis_N),
+        "zone_half_angle": np.asarray(drawn.constraints.half_angle),
         "settled": np.asarray(flown.settled),
         "violated": np.asarray(flown.violated),
         "settling_time": np.asarray(flown.settling_time),
@@ -110,16 +113,16 @@ def tumbles(task: TaskConfig) -> Tumbles:
     omega *= rng.uniform(0.0, _LARGEST_TUMBLE, (_TUMBLES, 1)) / np.linalg.norm(omega, axis=1, keepdims=True)
     with jax.enable_x64(True):
         start = RigidBodyState(jnp.asarray(q_BN / np.linalg.norm(q_BN, axis=1, keepdims=True)), jnp.asarray(omega))
-        flown = jax.jit(jax.vmap(lambda state: _free(state, task.spacecraft, task)))(start)
+        flown = jax.jit(jax.vmap(lambda state: _free(state, task)))(start)
         assert flown.q_BN.dtype == np.float64
         return Tumbles(np.asarray(flown.q_BN), np.asarray(flown.omega_BN_B))
 
 
-def _free(start: RigidBodyState, config: SpacecraftConfig, task: TaskConfig) -> RigidBodyState:
-    body = Spacecraft(jnp.array(config.inertia), jnp.array(config.boresight), jnp.array(config.torque_limit))
+def _free(start: RigidBodyState, task: TaskConfig) -> RigidBodyState:
+    inertia_B = jnp.array(task.spacecraft.inertia)
 
     def advance(state: RigidBodyState, _: None) -> tuple[RigidBodyState, RigidBodyState]:
-        following = dynamics.step(state, jnp.zeros(3), body, task.step_seconds)
+        following = dynamics.step(state, jnp.zeros(3), inertia_B, task.step_seconds)
         return following, following
 
     _, path = jax.lax.scan(advance, start, None, length=task.episode_steps)

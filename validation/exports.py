@@ -3,7 +3,7 @@
     python validation/exports.py --agent phase1 phase2 --cases 1000
 
 For C and for ONNX: the largest difference of an action over 10,000 observations; the verdicts (settled, violated) over
-the first cases of eval_mc.py's draw, which may differ only where a case is within rounding of a threshold; for C, the
+the first cases of ``koz evaluate``, which may differ only where a case is within rounding of a threshold; for C, the
 time and the memory per decision.  phase1 knows no zone: it is there because its verdicts vary.
 """
 
@@ -19,15 +19,17 @@ import numpy as np
 import onnxruntime
 import tyro
 
-from koz_jax import evaluation, runtime
-from koz_jax.agent import Agent, load_agent
-from koz_jax.errors import exit_status
-from koz_jax.evaluation import MonteCarloConfig
-from koz_jax.export.__main__ import export, write_files
+from koz_jax.agents.agent import Agent, load_agent
+from koz_jax.cli.exit_status import exit_status
+from koz_jax.config.base import checked
+from koz_jax.config.monte_carlo import MonteCarloConfig
+from koz_jax.evaluation.cases import fly_cases
+from koz_jax.evaluation.rollout import CaseResult
+from koz_jax.export.files import export, write_files
 from koz_jax.export.golden import golden
 from koz_jax.export.library import CLibrary
 from koz_jax.export.loop import HostController
-from koz_jax.rollout import CaseResult
+from koz_jax.storage import runtime
 
 _OBSERVATIONS = 10_000
 _ACTION_RANGE = 2.0
@@ -51,13 +53,13 @@ def main(argv: list[str]) -> int:
 
 
 def compare(args: ExportsArgs) -> int:
-    config = MonteCarloConfig(args.cases, args.seed)
+    config = checked(MonteCarloConfig, cases=args.cases, seed=args.seed)
     runtime.configure()
     return 0 if all([compare_agent(load_agent(name), config) for name in args.agent]) else 1
 
 
 def compare_agent(agent: Agent, config: MonteCarloConfig) -> bool:
-    flown = evaluation.fly_cases(agent.controller, agent.task, config)
+    flown = fly_cases(agent.controller, agent.task, config)
     print(f"{agent.name}: {verdicts(flown)}")
     with tempfile.TemporaryDirectory() as folder:
         write_files(Path(folder), export(agent, "c"))
@@ -86,7 +88,7 @@ def check(
     vectors = golden(agent, _OBSERVATIONS, seed=1)
     difference = np.abs(predict(vectors.observation) - vectors.action).max() / _ACTION_RANGE
     start = time.perf_counter()
-    found = evaluation.fly_cases(HostController(predict, agent.controller.network.observed_zones), agent.task, config)
+    found = fly_cases(HostController(predict, agent.controller.network.observed_zones), agent.task, config)
     seconds = time.perf_counter() - start
     differing = np.flatnonzero((found.settled != flown.settled) | (found.violated != flown.violated))
     print(f"{name}: largest difference of an action over {_OBSERVATIONS} observations: {difference:.1e} of the range")

@@ -1,1 +1,1 @@
-"""Trained agents for other programs: C99, ONNX, StableHLO.  ``python -m koz_jax.export AGENT --to c --out DIR``."""
+"""Trained agents for other programs: C99, ONNX, StableHLO.  ``koz export AGENT --to c --out DIR``."""

@@ -5,13 +5,17 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from koz_jax import dynamics, shield, task
+from koz_jax.agents.numpy_policy import NumpyPolicy, exported_zone_count
+from koz_jax.config.base import Vector
+from koz_jax.config.shield import ShieldConfig
+from koz_jax.control import shield
 from koz_jax.export.golden import Golden, ShieldGolden
 from koz_jax.export.metadata import Metadata, as_text, describe
-from koz_jax.export.names import C_FILES, SHIELD_FILES
-from koz_jax.layout import ACTION_SIZE, size
-from koz_jax.numpy_policy import NumpyPolicy, told_zones
-from koz_jax.shield_config import ShieldConfig
+from koz_jax.task import dynamics, environment
+from koz_jax.task.observation_layout import ACTION_SIZE, size
+
+C_FILES = ("koz_math.h", "koz_policy.h", "koz_policy.c", "koz_selftest.c", "Makefile")
+SHIELD_FILES = ("koz_shield.h", "koz_shield.c", "koz_shield_selftest.c")
 
 # 1e-5 of the action's range, which is 2.
 _ACTION_TOLERANCE = "2e-5"
@@ -26,10 +30,10 @@ def c_files(policy: NumpyPolicy, vectors: Golden) -> dict[str, bytes]:
     replacements = {
         "HEAD": _head(metadata),
         "OBSERVATION_SIZE": str(size(network.observed_zones)),
-        "ZONES": str(told_zones(network, metadata.task.scenario)),
+        "ZONES": str(exported_zone_count(network, metadata.task.scenario)),
         "OBSERVED_ZONES": str(network.observed_zones),
         "ACTION_SIZE": str(ACTION_SIZE),
-        "TORQUE_LIMIT": _number(metadata.torque_limit),
+        **_limits(metadata.torque_limit),
         "STEP_SECONDS": _number(metadata.step_seconds),
         "CONFIG_SHA256": metadata.provenance.config_sha256 or "unknown",
         "TRAINING_SHA256": metadata.training_sha256,
@@ -52,11 +56,11 @@ def c_files(policy: NumpyPolicy, vectors: Golden) -> dict[str, bytes]:
 def shield_files(policy: NumpyPolicy, config: ShieldConfig, vectors: ShieldGolden) -> dict[str, bytes]:
     """Header, source and self-test of a shield for the spacecraft of a policy, by file name."""
     metadata = describe(policy)
-    params = task.env_params(metadata.task)
-    made = shield.for_spacecraft(config, params.spacecraft, params.dt)
+    model = environment.model_from_config(metadata.task)
+    made = shield.from_config(config, model)
     matrices = {
-        "INERTIA": params.spacecraft.inertia_B,
-        "INVERSE_INERTIA": dynamics.inverse(params.spacecraft.inertia_B),
+        "INERTIA": model.inertia_B,
+        "INVERSE_INERTIA": dynamics.inverse(model.inertia_B),
     }
     numbers = {
         "MARGIN": made.margin,
@@ -73,7 +77,8 @@ def shield_files(policy: NumpyPolicy, config: ShieldConfig, vectors: ShieldGolde
         "EXPORT_ID": _export_id(metadata),
         "MARGIN_DEG": f"{np.rad2deg(made.margin):.4g}",
         "GUIDE_RATE_DEG": f"{config.guide_rate_deg:g}",
-        **{name.upper(): f"{error:g}" for name, error in config.withstands.model_dump().items()},
+        **{name.upper(): f"{error:g}" for name, error in config.error_bounds.model_dump().items()},
+        **_limits(metadata.torque_limit),
         "SAMPLES": str(made.samples),
         "COUNT": str(len(vectors.allowed)),
         "TOLERANCE": _TORQUE_TOLERANCE,
@@ -85,6 +90,29 @@ def shield_files(policy: NumpyPolicy, config: ShieldConfig, vectors: ShieldGolde
         **{name: _number(float(value)) for name, value in numbers.items()},
     }
     return {name: _fill(name, replacements).encode() for name in SHIELD_FILES}
+
+
+def _limits(limit: float | Vector) -> dict[str, str]:
+    """What templates say of the torque limits: a constant where all axes have the same, a macro of the axis else."""
+    if not isinstance(limit, tuple):
+        return {
+            "LIMIT_DEFINITION": f"KOZ_TORQUE_LIMIT {_number(limit)} /* [N m] about each body axis */",
+            "LIMIT_OF_I": "KOZ_TORQUE_LIMIT",
+            "LARGEST_LIMIT": "KOZ_TORQUE_LIMIT",
+            "LARGEST_TORQUE": "sqrtf(3.0f) * KOZ_TORQUE_LIMIT",
+            "SHARE_OF_I": "",
+            "SHARE": " / KOZ_TORQUE_LIMIT",
+        }
+    x, y, z = (_number(each) for each in limit)
+    choice = f"((axis) == 0 ? {x} : (axis) == 1 ? {y} : {z})"
+    return {
+        "LIMIT_DEFINITION": f"KOZ_TORQUE_LIMIT(axis) {choice} /* [N m] about a body axis */",
+        "LIMIT_OF_I": "KOZ_TORQUE_LIMIT(i)",
+        "LARGEST_LIMIT": _number(max(limit)),
+        "LARGEST_TORQUE": _number(float(np.linalg.norm(limit))),
+        "SHARE_OF_I": " / KOZ_TORQUE_LIMIT(i)",
+        "SHARE": "",
+    }
 
 
 def _export_id(metadata: Metadata) -> str:
@@ -117,7 +145,7 @@ def _rows(table: np.ndarray) -> str:
 
 
 def _situations(rows: np.ndarray, policy: NumpyPolicy) -> str:
-    zones = told_zones(policy.record.network, policy.record.task.scenario)
+    zones = exported_zone_count(policy.record.network, policy.record.task.scenario)
     return ",\n".join(_situation(row, zones) for row in rows)
 
 

@@ -8,15 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from koz_jax import env, observation, rotations, shield, task
-from koz_jax.agent import Agent
-from koz_jax.dynamics import RigidBodyState
-from koz_jax.env import EnvParams, EnvState
-from koz_jax.keep_out import NO_ZONE_HALF_ANGLE, KeepOutZone
-from koz_jax.numpy_policy import told_zones
-from koz_jax.scenario import Scenario
-from koz_jax.shield import Shield
-from koz_jax.shield_config import ShieldConfig
+from koz_jax.agents.agent import Agent
+from koz_jax.agents.numpy_policy import exported_zone_count
+from koz_jax.config.shield import ShieldConfig
+from koz_jax.control import shield
+from koz_jax.control.shield import Shield
+from koz_jax.task import environment, observation, rotations, state
+from koz_jax.task.dynamics import RigidBodyState
+from koz_jax.task.observation_layout import ABSENT_HALF_ANGLE
+from koz_jax.task.pointing_constraints import PointingConstraint
+from koz_jax.task.scenario import Scenario
+from koz_jax.task.state import EnvState, Model
 
 _SMALLEST_ANGLE_DEG, _LARGEST_RATE = 1e-3, 0.2  # [deg], [rad/s]
 _ABSENT = 0.25  # share of zones after the first
@@ -35,11 +37,12 @@ class Situation(struct.PyTreeNode):
     zone_half_angle: jax.Array  # (zones,) [rad]
     q_e0_previous: jax.Array  # ()
 
-    def state(self) -> EnvState:
-        """The core's own state."""
-        zones = KeepOutZone(self.zone_axis_N, self.zone_half_angle)
-        state = env.reset(Scenario(RigidBodyState(self.q_BN, self.omega_BN_B), self.q_DN, zones))
-        return state.replace(q_e0_previous=self.q_e0_previous)
+    def state(self, model: Model, boresight_B: jax.Array) -> EnvState:
+        """The core's own state.  boresight_B: (3,) of the instrument that the zones are for."""
+        boresights_B = jnp.tile(boresight_B, (len(self.zone_half_angle), 1))
+        zones = PointingConstraint(boresights_B, self.zone_axis_N, self.zone_half_angle)
+        drawn = Scenario(RigidBodyState(self.q_BN, self.omega_BN_B), self.q_DN, zones)
+        return state.begin(drawn, model).replace(q_e0_previous=self.q_e0_previous)
 
 
 class Golden(NamedTuple):
@@ -62,7 +65,7 @@ class ShieldGolden(NamedTuple):
 def golden(agent: Agent, count: int, seed: int = 0) -> Golden:
     """Draw situations and answer them."""
     drawn = situations(agent, count, seed)
-    observed = np.asarray(_observe(drawn, task.env_params(agent.task), agent.controller.network.observed_zones))
+    observed = np.asarray(_observe(drawn, *_known(agent), agent.controller.network.observed_zones))
     return Golden(_side_by_side(drawn), observed, agent.predict(observed))
 
 
@@ -71,31 +74,33 @@ def shield_golden(agent: Agent, config: ShieldConfig, count: int, seed: int = 0)
 
     Where other roundings could decide otherwise, as they do with a margin a little larger or smaller, none is kept.
     """
-    params = task.env_params(agent.task)
-    config.check(agent.task.spacecraft.torque_limit)
-    made = shield.for_spacecraft(config, params.spacecraft, params.dt)
+    limits = agent.task.spacecraft.torque_limits
+    config.check(limits)
+    model, boresight_B = _known(agent)
+    made = shield.from_config(config, model)
     drawn = situations(agent, _DRAWN_PER_VECTOR * count, seed)
-    limit = params.spacecraft.torque_limit
-    box = np.random.default_rng(seed).uniform(-limit, limit, (_DRAWN_PER_VECTOR * count, 3))
+    box = np.random.default_rng(seed).uniform(np.negative(limits), limits, (_DRAWN_PER_VECTOR * count, 3))
     requested = box.astype(np.float32)
     answers = [
-        _answer(made.replace(margin=made.margin + shift), drawn, requested, params)
+        _answer(made.replace(margin=made.margin + shift), drawn, requested, model, boresight_B)
         for shift in (0.0, _MARGIN_SHIFT, -_MARGIN_SHIFT)
     ]
     allowed, safe = (np.stack(answer) for answer in zip(*answers, strict=True))
-    steady = np.all(np.ptp(allowed, axis=0) < _STEADY * limit, axis=1) & (safe[0] == safe).all(axis=0)
+    steady = np.all(np.ptp(allowed, axis=0) < _STEADY * np.array(limits), axis=1) & (safe[0] == safe).all(axis=0)
     passed = np.all(allowed[0] == requested, axis=1)
     kept = np.concatenate([np.flatnonzero(steady & which)[: count // 2] for which in (passed, ~passed)])
     return ShieldGolden(_side_by_side(drawn)[kept], requested[kept], allowed[0][kept], safe[0][kept])
 
 
 @jax.jit
-def _answer(made: Shield, drawn: Situation, requested: jax.Array, params: EnvParams) -> tuple[jax.Array, jax.Array]:
+def _answer(
+    made: Shield, drawn: Situation, requested: jax.Array, model: Model, boresight_B: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     def one(situation: Situation, torque_B: jax.Array) -> tuple[jax.Array, jax.Array]:
-        state = situation.state()
-        zones = state.scenario.zones
-        allowed_B = made.filter(state.body, torque_B, zones, params)
-        return allowed_B, shield.is_safe(made, state.body, zones, params, made.margin)
+        at = situation.state(model, boresight_B)
+        zones = at.scenario.constraints
+        allowed_B = made.filter(at.body, torque_B, zones, state.torque_limits(at, model), model)
+        return allowed_B, shield.is_safe(made, at.body, zones, model, made.margin)
 
     return jax.vmap(one)(drawn, requested)
 
@@ -116,9 +121,9 @@ def situations(agent: Agent, count: int, seed: int = 0) -> Situation:
     angle = jnp.deg2rad(10 ** rng.uniform(np.log10(_SMALLEST_ANGLE_DEG), np.log10(180.0), count))
     rate = _LARGEST_RATE * 10 ** rng.uniform(-4.0, 0.0, count)
     q_DN, q_e = _directions(rng, count, 4), jax.vmap(rotations.from_axis_angle)(_directions(rng, count, 3), angle)
-    zones = told_zones(agent.controller.network, limits)
+    zones = exported_zone_count(agent.controller.network, limits)
     half_angle = np.deg2rad(rng.uniform(limits.min_half_angle_deg, limits.max_half_angle_deg, (count, zones)))
-    half_angle[:, 1:][rng.uniform(size=(count, zones - 1)) < _ABSENT] = NO_ZONE_HALF_ANGLE
+    half_angle[:, 1:][rng.uniform(size=(count, zones - 1)) < _ABSENT] = ABSENT_HALF_ANGLE
     return Situation(
         q_BN=jax.vmap(rotations.multiply)(q_DN, q_e),
         omega_BN_B=jnp.float32(rate[:, None] * _directions(rng, count, 3)),
@@ -136,5 +141,10 @@ def _directions(rng: np.random.Generator, count: int, size: int) -> jax.Array:
 
 
 @functools.partial(jax.jit, static_argnames="observed_zones")
-def _observe(drawn: Situation, params: EnvParams, observed_zones: int) -> jax.Array:
-    return jax.vmap(lambda one: observation.observe(one.state(), params, observed_zones))(drawn)
+def _observe(drawn: Situation, model: Model, boresight_B: jax.Array, observed_zones: int) -> jax.Array:
+    return jax.vmap(lambda one: observation.observe(one.state(model, boresight_B), observed_zones))(drawn)
+
+
+def _known(agent: Agent) -> tuple[Model, jax.Array]:
+    """Spacecraft of an agent, and the telescope (3,) in its body axes."""
+    return environment.model_from_config(agent.task), jnp.array(agent.task.spacecraft.boresight)

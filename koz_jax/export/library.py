@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from koz_jax.errors import UserError
-from koz_jax.layout import ACTION_SIZE
+from koz_jax.errors import SettingsError
+from koz_jax.task.observation_layout import ACTION_SIZE
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 
@@ -20,15 +20,15 @@ class CLibrary:
     def __init__(self, folder: Path | str, compiler: str = "cc") -> None:
         """Compile and load.
 
-        folder: where ``python -m koz_jax.export AGENT --to c`` has written.
+        folder: where ``koz export AGENT --to c`` has written.
 
         Raises:
-            UserError: there is no exported source, or it cannot be compiled.
+            SettingsError: there is no exported source, or it cannot be compiled.
 
         """
         source, shield = Path(folder) / "koz_policy.c", Path(folder) / "koz_shield.c"
         if not source.is_file():
-            raise UserError(f"folder: {folder} holds no koz_policy.c; python -m koz_jax.export AGENT --to c makes one")
+            raise SettingsError(f"folder: {folder} holds no koz_policy.c; koz export AGENT --to c makes one")
         with tempfile.TemporaryDirectory() as built:
             library = Path(built) / "koz_policy.so"
             sources = [str(path) for path in (source, shield) if path.is_file()]
@@ -36,9 +36,9 @@ class CLibrary:
             try:
                 done = subprocess.run(command, capture_output=True, text=True, check=False)
             except OSError as error:
-                raise UserError(f"compiler: {compiler!r} cannot be run: {error.strerror}") from None
+                raise SettingsError(f"compiler: {compiler!r} cannot be run: {error.strerror}") from None
             if done.returncode:
-                raise UserError(f"compiler: {compiler!r} refuses {source}: {done.stderr.strip()}")
+                raise SettingsError(f"compiler: {compiler!r} refuses {source}: {done.stderr.strip()}")
             self._functions = ctypes.CDLL(str(library))
         header = (Path(folder) / "koz_policy.h").read_text(encoding="utf-8")
         self.zones, self._observation_size = (
@@ -68,15 +68,15 @@ class CLibrary:
         """Torques (batch, 3) [N m] that the shield allows in place of the requested ones.
 
         Raises:
-            UserError: it was exported without a shield, or an input has another shape.
+            SettingsError: it was exported without a shield, or an input has another shape.
 
         """
         if not self.has_shield:
-            raise UserError("shield: this controller was exported without; --shield exports it")
+            raise SettingsError("shield: this controller was exported without; --shield exports it")
         told = _rows_of("situations", situations, 12 + 4 * self.zones)
         requested = _rows_of("torques", torques, ACTION_SIZE)
         if len(told) != len(requested):
-            raise UserError(f"torques: must be one for each of {len(told)} situations, got {len(requested)}")
+            raise SettingsError(f"torques: must be one for each of {len(told)} situations, got {len(requested)}")
         allowed = np.empty_like(requested)
         for row, torque, into in zip(told, requested, allowed, strict=True):
             self._functions.koz_shield(row.ctypes.data, torque.ctypes.data, into.ctypes.data)
@@ -97,5 +97,5 @@ def _rows_of(name: str, given: np.ndarray, entries: int) -> np.ndarray:
     """Rows as C reads them; one that is too short would be read beyond its end."""
     rows = np.ascontiguousarray(given, np.float32)
     if rows.ndim != 2 or rows.shape[1] != entries:
-        raise UserError(f"{name}: must have shape (batch, {entries}), got {rows.shape}")
+        raise SettingsError(f"{name}: must have shape (batch, {entries}), got {rows.shape}")
     return rows

@@ -6,10 +6,10 @@ import jax
 import numpy as np
 from flax import struct
 
-from koz_jax import observation
-from koz_jax.controllers.base import Memoryless
-from koz_jax.env import EnvParams, EnvState
-from koz_jax.layout import ACTION_SIZE
+from koz_jax.control.base import Memoryless
+from koz_jax.task import observation
+from koz_jax.task.observation_layout import ACTION_SIZE
+from koz_jax.task.state import EnvState, Model
 
 
 class HostController(Memoryless):
@@ -19,9 +19,9 @@ class HostController(Memoryless):
     """Actions (batch, 3) in [-1, 1] for observations (batch, entries), float32."""
     observed_zones: int = struct.field(pytree_node=False, default=1)
 
-    def decide(self, state: EnvState, params: EnvParams, memory: None) -> tuple[jax.Array, None]:
+    def decide(self, state: EnvState, model: Model, memory: None) -> tuple[jax.Array, None]:
         """Action (3,) in [-1, 1] for the state, by its observation."""
-        observed = observation.observe(state, params, self.observed_zones)
+        observed = observation.observe(state, self.observed_zones)
         shape = jax.ShapeDtypeStruct((ACTION_SIZE,), np.float32)
         return jax.pure_callback(self._ask, shape, observed, vmap_method="broadcast_all"), memory
 

@@ -4,13 +4,13 @@ import hashlib
 import json
 import textwrap
 
-from koz_jax import __version__
-from koz_jax.agent_files import Provenance, Record
-from koz_jax.config import NetworkConfig
-from koz_jax.layout import layout, meaning, slices
-from koz_jax.numpy_policy import NumpyPolicy
-from koz_jax.settings import Settings
-from koz_jax.task_config import ScenarioConfig, TaskConfig
+from koz_jax.agents.numpy_policy import NumpyPolicy
+from koz_jax.agents.record import Provenance, Record
+from koz_jax.config.base import Settings, Vector
+from koz_jax.config.task import ScenarioConfig, TaskConfig
+from koz_jax.config.training import NetworkConfig
+from koz_jax.config.version import version
+from koz_jax.task.observation_layout import layout, meaning, slices
 
 
 class Entry(Settings):
@@ -26,10 +26,10 @@ class Metadata(Settings):
     """What a user of an exported controller must know; goes to and from JSON."""
 
     name: str
-    koz_jax_version: str = __version__
+    koz_jax_version: str
     observation: tuple[Entry, ...]
     action: str = "three numbers in [-1, 1]; times torque_limit that is the torque in body axes [N m], held for a step"
-    torque_limit: float
+    torque_limit: float | Vector  # [N m] about each body axis: one number for all, or one for each
     step_seconds: float
     boresight_B: tuple[float, float, float]
     training_sha256: str
@@ -44,13 +44,15 @@ def describe(policy: NumpyPolicy) -> Metadata:
     record = policy.record
     zones = record.network.observed_zones
     where = slices(zones)
+    limits = record.task.spacecraft.torque_limits
     return Metadata(
         name=policy.name,
+        koz_jax_version=version(),
         observation=tuple(
             Entry(name=name, start=where[name].start, size=size, meaning=meaning(name))
             for name, size in layout(zones).items()
         ),
-        torque_limit=record.task.spacecraft.torque_limit,
+        torque_limit=limits[0] if len({*limits}) == 1 else limits,
         step_seconds=record.task.step_seconds,
         boresight_B=record.task.spacecraft.boresight,
         training_sha256=training_sha256(record),
@@ -86,7 +88,7 @@ def as_text(metadata: Metadata) -> str:
         " q_BN takes body components to inertial ones.",
         *(_entry_text(entry) for entry in metadata.observation),
         f"Action: {metadata.action}.",
-        f"Limits: torque {metadata.torque_limit:g} N m about each body axis; time step {metadata.step_seconds:g} s;"
+        f"Limits: torque {_torque(metadata.torque_limit)}; time step {metadata.step_seconds:g} s;"
         f" boresight {list(metadata.boresight_B)} in body axes; inertia {[list(r) for r in task.spacecraft.inertia]}"
         f" kg m^2; trained for {_count(task.scenario)} of {task.scenario.min_half_angle_deg:g} to"
         f" {task.scenario.max_half_angle_deg:g} deg half angle and maneuvers that start {_start(task.scenario)}.",
@@ -104,6 +106,12 @@ def _count(scenario: ScenarioConfig) -> str:
     if scenario.max_zones == 1:
         return "one zone"
     return f"{scenario.min_zones} to {scenario.max_zones} zones"
+
+
+def _torque(limit: float | Vector) -> str:
+    if isinstance(limit, tuple):
+        return f"{limit[0]:g}, {limit[1]:g} and {limit[2]:g} N m about the body axes"
+    return f"{limit:g} N m about each body axis"
 
 
 def _start(scenario: ScenarioConfig) -> str:

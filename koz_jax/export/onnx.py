@@ -4,16 +4,16 @@ from typing import Any
 
 import numpy as np
 
-from koz_jax.errors import UserError
+from koz_jax.agents.numpy_policy import NumpyPolicy
+from koz_jax.errors import missing_extra
 from koz_jax.export.metadata import describe
-from koz_jax.layout import ACTION_SIZE
-from koz_jax.numpy_policy import NumpyPolicy
+from koz_jax.task.observation_layout import ACTION_SIZE
 
 try:
     import onnx
     from onnx import helper, numpy_helper
 except ImportError as error:
-    raise UserError(f'to: onnx needs the package onnx: pip install "koz_jax[onnx]" ({error})') from None
+    raise missing_extra(error, "onnx", "onnx") from None
 
 # Old enough for runtimes of years ago, new enough for all operators here.
 _OPSET = 13
@@ -41,7 +41,7 @@ def onnx_files(policy: NumpyPolicy) -> dict[str, bytes]:
     metadata = describe(policy)
     graph = _Graph()
     action = _decide(graph, policy)
-    limit = graph.constant("torque_limit", np.float32(metadata.torque_limit))
+    limit = graph.constant("torque_limit", np.asarray(metadata.torque_limit, np.float32))
     graph.node("Mul", [action, limit], "torque_B")
 
     def rows(name: str, size: int) -> onnx.ValueInfoProto:

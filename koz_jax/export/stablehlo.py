@@ -7,10 +7,10 @@ import jax.export
 import jax.numpy as jnp
 from jax.export import Exported
 
-from koz_jax.agent import Agent
-from koz_jax.errors import UserError
+from koz_jax.agents.agent import Agent
+from koz_jax.errors import missing_extra
 from koz_jax.export.metadata import Metadata, as_text, describe
-from koz_jax.layout import size
+from koz_jax.task.observation_layout import size
 
 _PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 
@@ -25,7 +25,7 @@ def stablehlo_files(agent: Agent) -> dict[str, bytes]:
     - ``koz_policy.json``: the metadata.
 
     Raises:
-        UserError: a package that serialisation needs is not installed.
+        MissingExtraError: a package that serialisation needs is not installed.
 
     """
     metadata = describe(agent.to_numpy())
@@ -34,9 +34,7 @@ def stablehlo_files(agent: Agent) -> dict[str, bytes]:
     try:
         serialised = _exported(agent, metadata, (batch, entries), _PLATFORMS).serialize()
     except ImportError as error:
-        raise UserError(
-            f'to: stablehlo needs the package flatbuffers: pip install "koz_jax[stablehlo]" ({error})'
-        ) from None
+        raise missing_extra(error, "flatbuffers", "stablehlo") from None
     head = "".join(f"// {line}".rstrip() + "\n" for line in as_text(metadata).splitlines())
     return {
         "koz_policy.mlir": (head + _exported(agent, metadata, (entries,), ("cpu",)).mlir_module()).encode(),

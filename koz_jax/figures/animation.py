@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from koz_jax.figures import geometry, sphere, style
+from koz_jax.config.task import TaskConfig
+from koz_jax.evaluation.rollout import CaseResult, History
+from koz_jax.figures import geometry, palette, sphere, style
 from koz_jax.figures.style import Axes
-from koz_jax.rollout import CaseResult, History
-from koz_jax.task_config import TaskConfig
+from koz_jax.storage import files
 
 _SPEED = 2.5  # maneuver seconds per second of the picture
 _FRAMES_PER_SECOND = 12.5  # browsers keep to multiples of 10 ms
@@ -30,7 +31,7 @@ def shown_instants(history: History, result: CaseResult, task: TaskConfig) -> np
 
 def write(path: Path, history: History, result: CaseResult, task: TaskConfig, title: str = "") -> Path:
     """Write the moving picture of one maneuver."""
-    style.write_bytes(path, gif(history, result, task, title))
+    files.write_bytes(path, gif(history, result, task, title))
     return path
 
 
@@ -57,7 +58,7 @@ class _Scene:
     """A figure whose moving parts are set to any instant."""
 
     def __init__(self, history: History, task: TaskConfig, end: float, title: str) -> None:
-        self.traces = geometry.sphere_traces(history, task)
+        self.traces = geometry.sphere_traces(history)
         self.seconds = np.arange(len(history.zone_margin)) * task.step_seconds
         self.margin_deg = np.rad2deg(history.zone_margin)
         self.torque = np.asarray(history.torque_B)
@@ -66,7 +67,9 @@ class _Scene:
         grid = self.figure.add_gridspec(2, 2, width_ratios=[1.1, 1.0])
         self._draw_sphere(self.figure.add_subplot(grid[:, 0]))
         self.margin_line = self._draw_margin(self.figure.add_subplot(grid[0, 1]), end)
-        self.torque_lines = self._draw_torque(self.figure.add_subplot(grid[1, 1]), end, task.spacecraft.torque_limit)
+        self.torque_lines = self._draw_torque(
+            self.figure.add_subplot(grid[1, 1]), end, max(task.spacecraft.torque_limits)
+        )
         handles, labels = self.figure.axes[0].get_legend_handles_labels()
         self.figure.legend(handles, labels, loc="outside lower center", ncols=5, handlelength=1.6, columnspacing=1.2)
         self.figure.suptitle(title)
@@ -81,26 +84,28 @@ class _Scene:
 
     def _draw_sphere(self, axes: Axes) -> None:
         sphere.draw_scene(axes, self.traces, pixels=400)
-        sphere.mark(axes, self.traces.view, self.traces.trace_N[0], "x", style.BLUE, "start")
-        sphere.mark(axes, self.traces.view, self.traces.shortest_N[-1], "o", style.GREEN, "target")
-        (self.back,) = axes.plot([], [], color=style.BLACK, linewidth=1.2, alpha=0.45, linestyle=(0, (3, 2)), zorder=2)
-        (self.front,) = axes.plot([], [], color=style.BLACK, linewidth=2.2, zorder=4, label="boresight trace")
+        sphere.mark(axes, self.traces.view, self.traces.trace_N[0], "x", palette.START, "start")
+        sphere.mark(axes, self.traces.view, self.traces.shortest_N[-1], "o", palette.TARGET, "target")
+        (self.back,) = axes.plot(
+            [], [], color=palette.TRACE, linewidth=1.2, alpha=0.45, linestyle=(0, (3, 2)), zorder=2
+        )
+        (self.front,) = axes.plot([], [], color=palette.TRACE, linewidth=2.2, zorder=4, label="boresight trace")
         self.clock = axes.text(0.0, 1.0, "", transform=axes.transAxes, va="top", fontsize=11)
-        (self.dot,) = axes.plot([], [], "o", color=style.BLACK, markersize=5.5, zorder=6)
+        (self.dot,) = axes.plot([], [], "o", color=palette.TRACE, markersize=5.5, zorder=6)
 
     def _draw_margin(self, axes: Axes, end: float) -> style.Line2D:
         low, high = min(0.0, float(self.margin_deg.min())), float(self.margin_deg.max())
         axes.set(xlim=(0.0, end), ylim=(1.2 * low - 0.1 * high, 1.08 * high), ylabel="margin to zone [deg]")
         if self.traces.zones:
-            axes.axhspan(1.2 * low - 0.1 * high, 0.0, color=style.VERMILLION, alpha=0.2, linewidth=0)
-            axes.axhline(0.0, color=style.VERMILLION, linewidth=1.2)
-        return axes.plot([], [], color=style.BLACK, linewidth=1.6)[0]
+            axes.axhspan(1.2 * low - 0.1 * high, 0.0, color=palette.ZONE, alpha=0.2, linewidth=0)
+            axes.axhline(0.0, color=palette.ZONE, linewidth=1.2)
+        return axes.plot([], [], color=palette.TRACE, linewidth=1.6)[0]
 
     def _draw_torque(self, axes: Axes, end: float, limit: float) -> list[style.Line2D]:
         axes.set(xlim=(0.0, end), ylim=(-1.1 * limit, 1.1 * limit), xlabel="time [s]", ylabel="torque [N m]")
         lines = [
             axes.plot([], [], color=color, linewidth=1.3, drawstyle="steps-post", label=name)[0]
-            for name, color in zip("xyz", style.BODY_AXES, strict=True)
+            for name, color in zip("xyz", palette.BODY_AXES, strict=True)
         ]
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.0)
         return lines

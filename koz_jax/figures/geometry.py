@@ -9,9 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from koz_jax import rotations
-from koz_jax.rollout import History
-from koz_jax.task_config import TaskConfig
+from koz_jax.evaluation.rollout import History
+from koz_jax.task import rotations
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,26 +23,31 @@ class Zone:
 
 def zones(history: History) -> list[Zone]:
     """The zones of a maneuver; stand-ins for "no zone" are left out."""
-    stacked = jax.tree.map(lambda leaf: np.asarray(leaf[0], np.float64), history.state.scenario.zones)
+    stacked = jax.tree.map(lambda leaf: np.asarray(leaf[0], np.float64), history.state.scenario.constraints)
     pairs = zip(stacked.axis_N, stacked.half_angle, strict=True)
     return [Zone(axis_N / np.linalg.norm(axis_N), float(angle)) for axis_N, angle in pairs if angle > 0.0]
 
 
-def boresight_trace(history: History, boresight_B: tuple[float, float, float]) -> np.ndarray:
+def boresight(history: History) -> np.ndarray:
+    """The telescope in body axes, that of the first constraint.  Returns (3,) unit vector."""
+    return np.asarray(history.state.scenario.constraints.boresight_B[0, 0])
+
+
+def boresight_trace(history: History) -> np.ndarray:
     """Where the telescope looked at every instant.  Returns (steps + 1, 3)."""
-    turned = jax.vmap(rotations.rotate, in_axes=(0, None))(history.state.body.q_BN, jnp.array(boresight_B))
+    turned = jax.vmap(rotations.rotate, in_axes=(0, None))(history.state.body.q_BN, jnp.asarray(boresight(history)))
     return np.asarray(turned, np.float64)
 
 
 def shortest_path(
     q_BN: np.ndarray | jax.Array,
     q_DN: np.ndarray | jax.Array,
-    boresight_B: tuple[float, float, float],
+    boresight_B: np.ndarray,
     points: int = 201,
 ) -> np.ndarray:
     """Trace of the boresight along the eigen-axis rotation from an attitude to the desired one.
 
-    q_BN, q_DN: (4,) unit.  Returns (points, 3), start first.
+    q_BN, q_DN: (4,) unit; boresight_B: (3,).  Returns (points, 3), start first.
     """
     q_DN = jnp.asarray(q_DN)
     q_e = rotations.multiply(rotations.conjugate(q_DN), jnp.asarray(q_BN))
@@ -52,9 +56,8 @@ def shortest_path(
     axis = jnp.where(sine > 0.0, q_e[1:] / jnp.maximum(sine, 1e-12), jnp.array([1.0, 0.0, 0.0]))
 
     def looking(angle: jax.Array) -> jax.Array:
-        return rotations.rotate(
-            rotations.multiply(q_DN, rotations.from_axis_angle(axis, angle)), jnp.array(boresight_B)
-        )
+        q_LN = rotations.multiply(q_DN, rotations.from_axis_angle(axis, angle))
+        return rotations.rotate(q_LN, jnp.asarray(boresight_B))
 
     return np.asarray(jax.vmap(looking)(jnp.linspace(angle, 0.0, points)), np.float64)
 
@@ -152,16 +155,15 @@ class SphereTraces:
     view: View
 
 
-def sphere_traces(history: History, task: TaskConfig) -> SphereTraces:
+def sphere_traces(history: History) -> SphereTraces:
     """Compute what is drawn.  The scenario alone decides the view: two agents on one case are seen alike."""
-    boresight_B = task.spacecraft.boresight
     found = zones(history)
     circles_N = [zone_circle(zone) for zone in found]
-    shortest_N = shortest_path(history.state.body.q_BN[0], history.state.scenario.q_DN[0], boresight_B)
+    shortest_N = shortest_path(history.state.body.q_BN[0], history.state.scenario.q_DN[0], boresight(history))
     return SphereTraces(
         zones=found,
         circles_N=circles_N,
-        trace_N=boresight_trace(history, boresight_B),
+        trace_N=boresight_trace(history),
         shortest_N=shortest_N,
         deviation=float(history.state.angle[0]),
         view=view_of(np.concatenate([shortest_N, *circles_N])),

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from koz_jax.figures import geometry, style
+from koz_jax.config.task import TaskConfig
+from koz_jax.evaluation.rollout import CaseResult, History
+from koz_jax.figures import geometry, palette, style
 from koz_jax.figures.style import Axes, Figure
-from koz_jax.rollout import CaseResult, History
-from koz_jax.task_config import TaskConfig
 
 
 @style.look()
@@ -22,7 +22,7 @@ def draw(history: History, result: CaseResult, task: TaskConfig, title: str = ""
     if result.settled:
         settled = float(result.settling_time)
         for axes in panels:
-            axes.axvline(settled, color=style.GREY, linewidth=0.9, linestyle=":", zorder=1)
+            axes.axvline(settled, color=palette.GREY, linewidth=0.9, linestyle=":", zorder=1)
         panels[0].annotate(
             f"settled: {settled:.1f} s",
             (settled, 1.0),
@@ -43,8 +43,8 @@ def _legend(axes: Axes) -> None:
 
 
 def _draw_attitude(axes: Axes, seconds: np.ndarray, history: History) -> None:
-    q_e = np.asarray(history.observation[:, :4])
-    for i, color in enumerate((style.BLACK, *style.BODY_AXES)):
+    q_e = np.asarray(history.attitude_error)
+    for i, color in enumerate((palette.BLACK, *palette.BODY_AXES)):
         axes.plot(seconds, q_e[:, i], color=color, label=f"$q_{{e{i}}}$")
     axes.set(ylabel="attitude error $q_e$ [-]", ylim=(-1.08, 1.08))
     _legend(axes)
@@ -52,21 +52,24 @@ def _draw_attitude(axes: Axes, seconds: np.ndarray, history: History) -> None:
 
 def _draw_rates(axes: Axes, seconds: np.ndarray, history: History) -> None:
     omega_deg = np.rad2deg(history.state.body.omega_BN_B)
-    for name, values, color in zip("xyz", omega_deg.T, style.BODY_AXES, strict=True):
+    for name, values, color in zip("xyz", omega_deg.T, palette.BODY_AXES, strict=True):
         axes.plot(seconds, values, color=color, label=rf"$\omega_{name}$")
     axes.set_ylabel("body rate [deg/s]")
     _legend(axes)
 
 
 def _draw_torque(axes: Axes, seconds: np.ndarray, history: History, task: TaskConfig) -> None:
-    limit = task.spacecraft.torque_limit
-    for name, values, color in zip("xyz", np.asarray(history.torque_B).T, style.BODY_AXES, strict=True):
+    limits = task.spacecraft.torque_limits
+    for name, values, color in zip("xyz", np.asarray(history.torque_B).T, palette.BODY_AXES, strict=True):
         # The torque is held over a step.
         axes.plot(seconds, values, color=color, linewidth=1.0, drawstyle="steps-post", label=rf"$\tau_{name}$")
-    for bound in (-limit, limit):
-        label = "limit" if bound > 0 else None
-        axes.axhline(bound, color=style.GREY, linewidth=0.8, linestyle="--", zorder=1, label=label)
-    axes.set(ylabel="torque [N m]", ylim=(-1.15 * limit, 1.15 * limit))
+    # One line for axes with the same limit; where they differ, each has the colour of its axis.
+    bounds = {limits[0]: palette.GREY} if len({*limits}) == 1 else dict(zip(limits, palette.BODY_AXES, strict=True))
+    for limit, color in bounds.items():
+        for bound in (-limit, limit):
+            label = "limit" if bound == limits[0] else None
+            axes.axhline(bound, color=color, linewidth=0.8, linestyle="--", zorder=1, label=label)
+    axes.set(ylabel="torque [N m]", ylim=(-1.15 * max(limits), 1.15 * max(limits)))
     _legend(axes)
 
 
@@ -77,8 +80,8 @@ def _draw_margin(axes: Axes, seconds: np.ndarray, history: History) -> None:
         return
     margin_deg = np.rad2deg(history.zone_margin)
     low = min(-0.12 * margin_deg.max(), 1.25 * margin_deg.min())
-    axes.plot(seconds, margin_deg, color=style.BLACK, label=r"$\theta_\mathrm{margin}$")
-    axes.axhspan(low, 0.0, color=style.VERMILLION, alpha=0.18, linewidth=0, label="inside the\nzone")
-    axes.axhline(0.0, color=style.VERMILLION, linewidth=1.0, zorder=1)
+    axes.plot(seconds, margin_deg, color=palette.TRACE, label=r"$\theta_\mathrm{margin}$")
+    axes.axhspan(low, 0.0, color=palette.ZONE, alpha=0.18, linewidth=0, label="inside the\nzone")
+    axes.axhline(0.0, color=palette.ZONE, linewidth=1.0, zorder=1)
     axes.set_ylim(low, None)
     _legend(axes)

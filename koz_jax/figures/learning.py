@@ -1,19 +1,18 @@
-"""Learning curves of one or several runs: ``python -m koz_jax.figures.learning RUN [RUN ...] --out DIR``."""
+"""Learning curves of one or several runs: read from their logs, brought to common instants, drawn."""
 
 from __future__ import annotations
 
 import csv
 import dataclasses
 import io
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import numpy as np
-import tyro
 
-from koz_jax.errors import UserError, exit_status
-from koz_jax.summary import PAPER_TABLE
+from koz_jax.errors import SettingsError, StorageError
+from koz_jax.evaluation.summary import PAPER_TABLE
+from koz_jax.figures import palette
 
 if TYPE_CHECKING:
     from koz_jax.figures.style import Axes, Figure
@@ -44,17 +43,8 @@ _PANELS = (
     ),
 )
 
-_COLUMNS = ("updates", "curriculum/phase", "refine/cost", *(panel.column for panel in _PANELS))
-
-
-@dataclasses.dataclass(frozen=True)
-class LearningArgs:
-    """Draw the learning curves of runs: the evaluations on the way, median and spread over the runs."""
-
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Folders of runs, for example of the same preset with several seeds."""
-    out: Path = Path("figures")
-    """Folder for learning.png and learning.pdf."""
+# Those of a run's ``metrics.csv`` that are drawn.
+COLUMNS = ("updates", "curriculum/phase", "refine/cost", *(panel.column for panel in _PANELS))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,29 +75,30 @@ def read_metrics(run: Path) -> dict[str, np.ndarray]:
     """Read the columns of a run's ``metrics.csv`` that are drawn.  Returns arrays (rows,), nan where a cell is empty.
 
     Raises:
-        UserError: there is no such file, or it is not one that a training wrote.
+        SettingsError: there is no such file.
+        StorageError: it is not one that a training wrote.
 
     """
     path = run / "metrics.csv"
     if not path.is_file():
-        raise UserError(f"runs: {run} is not a run folder (it has no metrics.csv)")
+        raise SettingsError(f"runs: {run} is not a run folder (it has no metrics.csv)")
     try:
         # A training under way may not have finished its last line.
         lines = path.read_bytes().decode("utf-8").rpartition("\n")[0]
         rows = list(csv.DictReader(io.StringIO(lines), strict=True))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"{path}: cannot be read as CSV: {error}") from None
+        raise StorageError(f"{path}: cannot be read as CSV: {error}") from None
     if not rows:
-        raise UserError(f"{path}: has no rows yet; the run has logged nothing")
-    missing = [name for name in _COLUMNS if name not in rows[0]]
+        raise StorageError(f"{path}: has no rows yet; the run has logged nothing")
+    missing = [name for name in COLUMNS if name not in rows[0]]
     if missing:
-        raise UserError(f"{path}: has no column {missing[0]!r}; it is not a training's log")
+        raise StorageError(f"{path}: has no column {missing[0]!r}; it is not a training's log")
     try:
-        columns = {name: np.array([float(row[name] or "nan") for row in rows]) for name in _COLUMNS}
+        columns = {name: np.array([float(row[name] or "nan") for row in rows]) for name in COLUMNS}
     except ValueError as error:
-        raise UserError(f"{path}: a cell is not a number: {error}") from None
+        raise StorageError(f"{path}: a cell is not a number: {error}") from None
     if not np.isfinite(columns["updates"]).all():
-        raise UserError(f"{path}: has a row without its number of updates")
+        raise StorageError(f"{path}: has a row without its number of updates")
     return columns
 
 
@@ -115,7 +106,7 @@ def stages(logs: list[dict[str, np.ndarray]]) -> Stages:
     """Find the stages of the longest run, which stand for all.
 
     Raises:
-        UserError: the refinement of some begins where others still learn; one axis cannot show both.
+        SettingsError: the refinement of some begins where others still learn; one axis cannot show both.
 
     """
 
@@ -124,7 +115,7 @@ def stages(logs: list[dict[str, np.ndarray]]) -> Stages:
 
     begins = {last(log, np.isnan(log["refine/cost"])) for log in logs if np.isfinite(log["refine/cost"]).any()}
     if len(begins) > 1:
-        raise UserError(f"runs: draw runs of one preset together; these learned for {sorted(begins)} updates")
+        raise SettingsError(f"runs: draw runs of one preset together; these learned for {sorted(begins)} updates")
     log = max(logs, key=lambda log: log["updates"].max())
     learning, in_phase1 = np.isnan(log["refine/cost"]), log["curriculum/phase"] == 1
     # The row at the end of phase 1 carries the curriculum of what comes next: phase 2.
@@ -167,19 +158,19 @@ def draw(shown: Curves, title: str = "") -> Figure:
 
 
 def _draw_panel(axes: Axes, panel: _Panel, shown: Curves) -> None:
-    from koz_jax.figures import style
-
     values = panel.factor * shown.values[panel.column]
     known = np.isfinite(values).any(axis=0)
     x, values = shown.stages.position(shown.done[known]), values[:, known]
     runs = len(values)
     if runs > 1:
         low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
-        axes.fill_between(x, low, high, color=style.SKY, alpha=0.45, linewidth=0, label=f"lowest to highest of {runs}")
+        axes.fill_between(
+            x, low, high, color=palette.SKY, alpha=0.45, linewidth=0, label=f"lowest to highest of {runs}"
+        )
     label = f"median of {runs} runs" if runs > 1 else "evaluation during training"
-    axes.plot(x, np.nanmedian(values, axis=0), color=style.BLUE, marker=".", markersize=4, label=label)
+    axes.plot(x, np.nanmedian(values, axis=0), color=palette.BLUE, marker=".", markersize=4, label=label)
     axes.axhline(
-        panel.paper, color=style.VERMILLION, linestyle="--", linewidth=1.0, label="paper's agent, 10,000 cases"
+        panel.paper, color=palette.VERMILLION, linestyle="--", linewidth=1.0, label="paper's agent, 10,000 cases"
     )
     if panel.logarithmic:
         axes.set_yscale("log")
@@ -190,8 +181,6 @@ def _draw_panel(axes: Axes, panel: _Panel, shown: Curves) -> None:
 
 def _draw_stages(axes: Axes, found: Stages) -> None:
     """Separate and name the stages; ticks say where each ends."""
-    from koz_jax.figures import style
-
     ends = {"phase 1": found.phase1, "phase 2": found.learned, "refine": found.length}
     begin, ticks = 0, {0.0: "0"}
     for name, end in ends.items():
@@ -199,7 +188,7 @@ def _draw_stages(axes: Axes, found: Stages) -> None:
             continue
         left, right = (float(found.position(at)) for at in (begin, end))
         axes.text(0.5 * (left + right), 1.01, name, transform=axes.get_xaxis_transform(), ha="center", fontsize=7.5)
-        axes.axvline(right, color=style.GREY, linewidth=0.8, linestyle=":")
+        axes.axvline(right, color=palette.GREY, linewidth=0.8, linestyle=":")
         ticks[right] = _count(end) if name != "refine" else f"+{_count(end - begin)}"
         begin = end
     axes.set_xticks(list(ticks), list(ticks.values()))
@@ -212,30 +201,3 @@ def _count(number: int) -> str:
     """A count in few characters: 400, 40k, 2.5M."""
     factor, unit = (1e6, "M") if number >= 1e6 else (1e3, "k") if number >= 1e3 else (1.0, "")
     return f"{number / factor:.3g}{unit}"
-
-
-def main(argv: list[str]) -> int:
-    """Read and draw.  Returns the exit status."""
-    prog = "python -m koz_jax.figures.learning"
-    return exit_status(lambda: _draw_runs(tyro.cli(LearningArgs, args=argv, prog=prog)))
-
-
-def _draw_runs(args: LearningArgs) -> int:
-    from koz_jax import storage
-    from koz_jax.figures import style
-
-    if not args.runs:
-        raise UserError("runs: give the folder of one run or more")
-    logs = [read_metrics(run) for run in args.runs]
-    shown = curves(logs)
-    if not len(shown.done):
-        raise UserError(f"runs: no evaluation in {', '.join(map(str, args.runs))} yet")
-    storage.make_folder("out", args.out)
-    names = ", ".join(run.resolve().name for run in args.runs[:4]) + (", ..." if len(args.runs) > 4 else "")
-    for path in style.save(draw(shown, f"Learning curves: {names}"), args.out, "learning"):
-        print(f"figure: {path}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

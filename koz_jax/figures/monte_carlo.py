@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from koz_jax.figures import style
+from koz_jax.config.task import TaskConfig
+from koz_jax.evaluation.rollout import CaseResult
+from koz_jax.figures import palette, style
 from koz_jax.figures.style import Axes, Figure
-from koz_jax.rollout import CaseResult
-from koz_jax.task_config import TaskConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,9 +21,9 @@ class Verdict:
     size: float  # [points^2]
 
 
-SETTLED = Verdict("settled, zone kept", style.BLUE, "o", 5.0)
-VIOLATED = Verdict("zone violated", style.PURPLE, "^", 16.0)
-NOT_SETTLED = Verdict("not settled", style.ORANGE, "s", 16.0)
+SETTLED = Verdict("settled, zone kept", palette.BLUE, "o", 5.0)
+VIOLATED = Verdict("zone violated", palette.PURPLE, "^", 16.0)
+NOT_SETTLED = Verdict("not settled", palette.ORANGE, "s", 16.0)
 VERDICTS = (SETTLED, VIOLATED, NOT_SETTLED)
 
 
@@ -119,7 +119,7 @@ def draw_accuracy(shown: Points, limit_deg: float, title: str = "") -> Figure:
     for axes in (everything, settled_only):
         axes.set(ylabel=r"pointing error $\varphi$ at the end [deg]", yscale="log")
         label = f"accuracy asked for, {limit_deg:g} deg" if axes is everything else None
-        axes.axhline(limit_deg, color=style.BLACK, linewidth=1.0, linestyle="--", label=label)
+        axes.axhline(limit_deg, color=palette.BLACK, linewidth=1.0, linestyle="--", label=label)
     _finish(figure, shown, title)
     return figure
 
@@ -155,7 +155,7 @@ def _scatter(axes: Axes, x: np.ndarray, y: np.ndarray, shown: Points, chosen: np
 def _name_not_settled(axes: Axes, shown: Points) -> None:
     """Say on the axis of settling times that one of them is none."""
     if not shown.settled.all():
-        axes.axhline(shown.not_settled_at, color=style.GREY, linewidth=0.8, linestyle=":", zorder=1)
+        axes.axhline(shown.not_settled_at, color=palette.GREY, linewidth=0.8, linestyle=":", zorder=1)
         note = f"did not settle: drawn at {shown.not_settled_at:g} s"
         axes.annotate(note, (0.0, shown.not_settled_at), xytext=(8, -11), textcoords="offset points", fontsize=7.5)
 

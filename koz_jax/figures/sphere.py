@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from koz_jax.figures import geometry, style
+from koz_jax.config.task import TaskConfig
+from koz_jax.evaluation.rollout import History
+from koz_jax.figures import geometry, palette, style
 from koz_jax.figures.geometry import SphereTraces, View, Zone
 from koz_jax.figures.style import Axes, Figure
-from koz_jax.rollout import History
-from koz_jax.task_config import TaskConfig
 
 _PIXELS = 800  # of the shaded sphere
 
@@ -18,14 +18,14 @@ def draw(history: History, task: TaskConfig, title: str = "") -> Figure:
     """Draw the trace of one maneuver as the paper does: start a blue cross, end a green dot, zone red, trace black."""
     figure = style.new_figure(5.2, 6.3)
     axes = figure.add_subplot()
-    traces = geometry.sphere_traces(history, task)
+    traces = geometry.sphere_traces(history)
     draw_scene(axes, traces)
-    draw_line(axes, traces.view, traces.trace_N, style.BLACK, 1.8, "boresight trace")
-    mark(axes, traces.view, traces.trace_N[0], "x", style.BLUE, "start")
-    mark(axes, traces.view, traces.trace_N[-1], "o", style.GREEN, f"end, after {task.episode_seconds:g} s")
+    draw_line(axes, traces.view, traces.trace_N, palette.TRACE, 1.8, "boresight trace")
+    mark(axes, traces.view, traces.trace_N[0], "x", palette.START, "start")
+    mark(axes, traces.view, traces.trace_N[-1], "o", palette.TARGET, f"end, after {task.episode_seconds:g} s")
     figure.suptitle(title)
     figure.legend(loc="outside lower center", ncols=2, handlelength=2.4)
-    axes.text(0.5, -0.02, _NOTE, transform=axes.transAxes, ha="center", va="top", fontsize=7.5, color=style.GREY)
+    axes.text(0.5, -0.02, _NOTE, transform=axes.transAxes, ha="center", va="top", fontsize=7.5, color=palette.GREY)
     return figure
 
 
@@ -34,16 +34,16 @@ def draw_scene(axes: Axes, traces: SphereTraces, pixels: int = _PIXELS) -> None:
     picture = sphere_picture(traces.view, traces.zones, pixels)
     axes.imshow(picture, extent=(-1.0, 1.0, -1.0, 1.0), interpolation="bilinear", zorder=0)
     turn = np.linspace(0.0, 2.0 * np.pi, 361)
-    axes.plot(np.cos(turn), np.sin(turn), color=style.GREY, linewidth=0.8, zorder=1)
+    axes.plot(np.cos(turn), np.sin(turn), color=palette.GREY, linewidth=0.8, zorder=1)
     for line in geometry.graticule():
         front, _ = geometry.front_and_back(traces.view.project(line))
         axes.plot(*front.T, color="#9A9A9A", linewidth=0.4, zorder=1)
     _draw_axes_of_space(axes, traces.view)
     for zone, circle in zip(traces.zones, traces.circles_N, strict=True):
         label = f"keep-out zone, half angle {np.rad2deg(zone.half_angle):.1f}°"
-        draw_line(axes, traces.view, circle, style.VERMILLION, 1.8, label)
+        draw_line(axes, traces.view, circle, palette.ZONE, 1.8, label)
     label = f"shortest path ({np.rad2deg(traces.deviation):.0f}° rotation)"
-    draw_line(axes, traces.view, traces.shortest_N, style.BLUE, 1.4, label)
+    draw_line(axes, traces.view, traces.shortest_N, palette.SHORTEST, 1.4, label)
     axes.set(xlim=(-1.13, 1.13), ylim=(-1.13, 1.13), aspect="equal")
     axes.set_axis_off()
 
@@ -93,7 +93,7 @@ def _draw_axes_of_space(axes: Axes, view: View) -> None:
     """Draw the inertial axes, from the sphere's surface outwards."""
     for name, axis_N in zip("xyz", np.eye(3), strict=True):
         right, up, depth = view.project(axis_N)
-        color, zorder = (style.BLACK, 4) if depth >= 0.0 else (style.GREY, 0)
+        color, zorder = (palette.BLACK, 4) if depth >= 0.0 else (palette.GREY, 0)
         stem = np.array([1.0, 1.08])
         axes.plot(right * stem, up * stem, color=color, linewidth=0.9, zorder=zorder)
         axes.text(1.13 * right, 1.13 * up, name, color=color, style="italic", ha="center", va="center", zorder=zorder)

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from koz_jax.errors import UserError
+from koz_jax.errors import missing_extra
+from koz_jax.storage import files
 
 try:
     import matplotlib
@@ -15,20 +16,7 @@ try:
     from matplotlib.figure import Figure as Figure
     from matplotlib.lines import Line2D as Line2D
 except ImportError as error:
-    raise UserError(f'figures need matplotlib: pip install "koz_jax[viz]" ({error})') from None
-
-# Okabe & Ito's palette: told apart also by readers who do not see all colours.
-BLACK = "#000000"
-BLUE = "#0072B2"
-SKY = "#56B4E9"
-GREEN = "#009E73"
-ORANGE = "#E69F00"
-VERMILLION = "#D55E00"
-PURPLE = "#CC79A7"
-GREY = "#7F7F7F"
-
-# Three body axes, from dark to light, so that they differ also without colours.
-BODY_AXES = (BLUE, VERMILLION, ORANGE)
+    raise missing_extra(error, "matplotlib", "viz") from None
 
 PNG_DPI = 200
 RASTER_DPI = 300  # of point clouds inside a PDF
@@ -78,18 +66,10 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     figure.savefig(document, format="pdf", dpi=RASTER_DPI, metadata={"CreationDate": None})
     contents = {folder / f"{name}.png": picture.getvalue(), folder / f"{name}.pdf": document.getvalue()}
     for path, content in contents.items():
-        write_bytes(path, content)
+        files.write_bytes(path, content)
     return list(contents)
 
 
 def short_name(agent: str) -> str:
     """Name of an agent for a title: a shipped one's own, or the last part of a folder."""
     return Path(agent).resolve().name or agent
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file, or say why it cannot be written."""
-    try:
-        path.write_bytes(content)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror or error}") from error

@@ -86,5 +86,5 @@ void koz_torque(const float observation[KOZ_OBSERVATION_SIZE], float torque_B[KO
 {
     int i;
     koz_decide(observation, torque_B);
-    for (i = 0; i < KOZ_ACTION_SIZE; i++) torque_B[i] *= KOZ_TORQUE_LIMIT;
+    for (i = 0; i < KOZ_ACTION_SIZE; i++) torque_B[i] *= @LIMIT_OF_I@;
 }

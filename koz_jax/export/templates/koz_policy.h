@@ -8,7 +8,7 @@
 #define KOZ_ZONES @ZONES@ /* zones to be told of */
 #define KOZ_OBSERVED_ZONES @OBSERVED_ZONES@ /* of which the policy sees the nearest */
 #define KOZ_ACTION_SIZE @ACTION_SIZE@
-#define KOZ_TORQUE_LIMIT @TORQUE_LIMIT@ /* [N m] about each body axis */
+#define @LIMIT_DEFINITION@
 #define KOZ_STEP_SECONDS @STEP_SECONDS@ /* [s] between decisions; the torque is held in between */
 #define KOZ_CONFIG_SHA256 "@CONFIG_SHA256@" /* config.json of the training run */
 #define KOZ_TRAINING_SHA256 "@TRAINING_SHA256@" /* network, task and origin */

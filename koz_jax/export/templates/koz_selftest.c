@@ -47,7 +47,7 @@ int main(void)
         koz_torque(observations[n], torque_B);
         for (i = 0; i < KOZ_ACTION_SIZE; i++) {
             decided = worse(decided, action[i], actions[n][i]);
-            applied = worse(applied, torque_B[i], KOZ_TORQUE_LIMIT * actions[n][i]);
+            applied = worse(applied, torque_B[i], @LIMIT_OF_I@ * actions[n][i]);
         }
     }
     start = clock();
@@ -58,7 +58,7 @@ int main(void)
     }
     seconds = (double)(clock() - start) / (double)CLOCKS_PER_SEC;
     passed = observed <= OBSERVATION_TOLERANCE && decided <= ACTION_TOLERANCE
-        && applied <= KOZ_TORQUE_LIMIT * ACTION_TOLERANCE && kept == kept;
+        && applied <= @LARGEST_LIMIT@ * ACTION_TOLERANCE && kept == kept;
     printf("golden vectors: %d\n", COUNT);
     printf("largest difference of an observation: %.2e (tolerance %.0e)\n", observed, OBSERVATION_TOLERANCE);
     printf("largest difference of an action: %.2e (tolerance %.0e)\n", decided, ACTION_TOLERANCE);

@@ -184,7 +184,7 @@ static int is_safe(const koz_situation *now, const body_state *body, float margi
 /* Whether the boresight stays outside all zones during the step itself. */
 static int step_is_clear(const koz_situation *now, const body_state *before, const body_state *after)
 {
-    const float thrust = sqrtf(3.0f) * KOZ_TORQUE_LIMIT / smallest_moment;
+    const float thrust = @LARGEST_TORQUE@ / smallest_moment;
     float fastest = larger(koz_norm(before->omega_BN_B), koz_norm(after->omega_BN_B)) + thrust * KOZ_STEP_SECONDS;
     float bulge = ((1.0f + spread()) * fastest * fastest + thrust) * KOZ_STEP_SECONDS * KOZ_STEP_SECONDS / 8.0f;
     float start_N[3], end_N[3];
@@ -260,9 +260,9 @@ static void guide(const koz_situation *now, const body_state *body, const float 
     largest = 0.0f;
     for (i = 0; i < 3; i++) {
         torque_B[i] += gyroscopic_B[i];
-        largest = larger(largest, fabsf(torque_B[i]));
+        largest = larger(largest, fabsf(torque_B[i])@SHARE_OF_I@);
     }
-    largest = larger(1.0f, largest / KOZ_TORQUE_LIMIT);
+    largest = larger(1.0f, largest@SHARE@);
     for (i = 0; i < 3; i++) torque_B[i] /= largest;
 }
 
@@ -288,7 +288,7 @@ void koz_shield(const koz_situation *now, const float requested_B[3], float allo
     int i, tried;
     body_of(now, &body);
     for (i = 0; i < 3; i++)
-        candidates_B[0][i] = larger(-KOZ_TORQUE_LIMIT, smaller(KOZ_TORQUE_LIMIT, requested_B[i]));
+        candidates_B[0][i] = larger(-@LIMIT_OF_I@, smaller(@LIMIT_OF_I@, requested_B[i]));
     guide(now, &body, candidates_B[0], candidates_B[2]);
     for (i = 0; i < 3; i++) candidates_B[1][i] = 0.5f * (candidates_B[0][i] + candidates_B[2][i]);
     for (tried = 0; tried < CANDIDATES; tried++) {

@@ -37,7 +37,7 @@ int main(void)
     for (n = 0; n < COUNT; n++) {
         koz_shield(&situations[n], requested[n], torque_B);
         for (i = 0; i < 3; i++) {
-            const double difference = fabs((double)torque_B[i] - (double)allowed[n][i]) / KOZ_TORQUE_LIMIT;
+            const double difference = fabs((double)torque_B[i] - (double)allowed[n][i]) / @LIMIT_OF_I@;
             worst = difference <= worst ? worst : difference; /* not a number counts as the largest */
         }
         misjudged += koz_is_safe(&situations[n]) != safe[n];

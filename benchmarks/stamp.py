@@ -1,0 +1,58 @@
+"""What a table needs beside its numbers: the command that made it, the commit, and the machine."""
+
+import os
+import platform
+import shlex
+import subprocess
+import time
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+
+from koz_jax.storage import files
+
+_ROOT = Path(__file__).resolve().parent.parent
+_SIDE = 2048
+
+
+def write_table(path: Path, argv: list[str], table: str) -> None:
+    """Write a Markdown table with its origin above it, for a page to include.  argv: what the command was given."""
+    head = f"Made by `{shlex.join(['python', *argv])}` at commit {commit()}; {machine()}."
+    files.write_text(path, f"<!-- made by a command, see below; do not edit -->\n{head}\n\n{table}\n")
+
+
+def commit() -> str:
+    """Abbreviated commit of the checkout, marked where tracked files differ from it."""
+    command = ["git", "-C", str(_ROOT), "describe", "--always", "--abbrev=7", "--exclude=*", "--dirty=+changes"]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    return found.stdout.strip() or "unknown"
+
+
+def machine() -> str:
+    """Processor, cores that may be used, rate of a matrix product, versions."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    versions = ", ".join(f"{name} {metadata.version(name)}" for name in ("jax", "numpy"))
+    return (
+        f"{cores} cores of {_processor()}, {matmul_rate() / 1e9:.0f} GFLOP/s (NumPy, float32, {_SIDE} x {_SIDE}"
+        f" matrices), Python {platform.python_version()}, {versions}"
+    )
+
+
+def matmul_rate(repeats: int = 5) -> float:
+    """FLOP/s of a large float32 matrix product on all cores, the best of several."""
+    left = np.ones((_SIDE, _SIDE), np.float32)
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        np.matmul(left, left)
+        seconds.append(time.perf_counter() - start)
+    return 2.0 * _SIDE**3 / min(seconds)
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.machine()
+    return next((line.partition(": ")[2] for line in lines if line.startswith("model name")), platform.machine())

@@ -1,0 +1,1 @@
+"""The environment behind the contracts of other libraries."""

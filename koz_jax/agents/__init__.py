@@ -1,0 +1,1 @@
+"""Trained agents: loading, asking, saving; the shipped ones."""

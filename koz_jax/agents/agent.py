@@ -1,0 +1,83 @@
+"""A trained agent: load it, ask it, save it."""
+
+import dataclasses
+import functools
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
+
+from koz_jax.agents import numpy_policy
+from koz_jax.agents.numpy_policy import NumpyPolicy
+from koz_jax.agents.record import Provenance, Record, find_agent, read_agent_record
+from koz_jax.agents.sb3 import is_sb3, read_sb3
+from koz_jax.config.task import TaskConfig
+from koz_jax.control.policy import PolicyController, policy_network
+from koz_jax.errors import SettingsError
+from koz_jax.storage import archive
+from koz_jax.task import observation_layout
+from koz_jax.task.observation_layout import as_observations
+
+
+@dataclasses.dataclass(frozen=True)
+class Agent:
+    """A policy with what is needed to fly it and to know where it comes from."""
+
+    controller: PolicyController
+    task: TaskConfig
+    provenance: Provenance
+    name: str
+
+    def predict(self, observations: np.ndarray) -> np.ndarray:
+        """Deterministic actions.
+
+        observations: (16,) or (batch, 16), in the order of ``observation_layout.layout``; 5 entries more for each
+        further zone that the agent sees.  Returns (3,) or (batch, 3) in [-1, 1]; times the torque limits that is the
+        torque in body axes.
+        """
+        observed = as_observations(observations, self.controller.network.observed_zones)
+        return np.asarray(_act(self.controller, observed))
+
+    def to_numpy(self) -> NumpyPolicy:
+        """The deterministic policy without jax, as ``numpy_policy.load_policy`` reads it."""
+        arrays = {name: np.asarray(leaf) for name, leaf in flatten_dict(self.controller.policy, sep="/").items()}
+        return numpy_policy.from_arrays(arrays, self._record(), self.name)
+
+    def _record(self) -> Record:
+        return Record(network=self.controller.network, task=self.task, provenance=self.provenance)
+
+    def save(self, folder: Path | str) -> None:
+        """Write the agent as a folder of arrays and JSON."""
+        archive.save_tree(Path(folder), self.controller.policy, self._record().model_dump())
+
+
+@jax.jit
+def _act(controller: PolicyController, observed: jax.Array) -> jax.Array:
+    return controller.act(observed)
+
+
+def load_agent(name: str | Path = "phase2", task: TaskConfig | None = None) -> Agent:
+    """Load an agent by name or folder, see ``find_agent``; or a zip of Stable-Baselines3, see ``agents.sb3``.
+
+    task: what the agent of a zip was trained for, by default the paper's; agents of ours know theirs.
+
+    Raises:
+        SettingsError: there is no such agent, its files are damaged, or it is not of the task.
+
+    """
+    if is_sb3(name):
+        record, arrays = read_sb3(name, task or TaskConfig())
+        policy = unflatten_dict({leaf: jnp.asarray(array) for leaf, array in arrays.items()}, sep="/")
+        return Agent(PolicyController(policy, record.network), record.task, record.provenance, str(name))
+    if task is not None:
+        raise SettingsError(f"task: is told for zips of Stable-Baselines3 only, got one for {name}")
+    folder = find_agent(name)
+    record = read_agent_record(folder)
+    template = jax.eval_shape(
+        functools.partial(policy_network(record.network).init, jax.random.key(0)),
+        jax.ShapeDtypeStruct((observation_layout.size(record.network.observed_zones),), np.float32),
+    )
+    policy = archive.load_tree(folder, template)
+    return Agent(PolicyController(policy, record.network), record.task, record.provenance, str(name))

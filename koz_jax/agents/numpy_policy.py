@@ -1,0 +1,112 @@
+"""Ask a trained agent with NumPy alone, for those who only fly it: importing this imports no jax.
+
+>>> policy = load_policy("phase2")
+>>> torque_B = policy.record.task.spacecraft.torque_limits * policy.predict(observation)
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from koz_jax.agents.record import Record, find_agent, read_agent_record
+from koz_jax.config.task import ScenarioConfig
+from koz_jax.config.training import NetworkConfig
+from koz_jax.control.encoding import Views, views
+from koz_jax.errors import DamagedFileError
+from koz_jax.storage import archive
+from koz_jax.task.observation_layout import ACTION_SIZE, as_observations, size
+
+
+@dataclasses.dataclass(frozen=True)
+class Layer:
+    """x -> x kernel + bias."""
+
+    kernel: np.ndarray  # (inputs, outputs) float32
+    bias: np.ndarray  # (outputs,) float32
+
+
+@dataclasses.dataclass(frozen=True)
+class NumpyPolicy:
+    """The deterministic policy of an agent: what it sees, and its layers (ReLU between, tanh at the end)."""
+
+    views: Views
+    layers: tuple[Layer, ...]
+    record: Record
+    name: str
+
+    def predict(self, observations: np.ndarray) -> np.ndarray:
+        """Deterministic actions, as ``Agent.predict`` to rounding.
+
+        observations: (16,) or (batch, 16), in the order of ``observation_layout.layout``; 5 entries more for each
+        further zone that the agent sees.  Returns (3,) or (batch, 3) in [-1, 1]; times the torque limits that is the
+        torque in body axes.
+        """
+        observed = as_observations(observations, self.record.network.observed_zones)
+        seen = [np.tanh(observed[..., start:stop] / np.float32(scale)) for start, stop, scale in self.views]
+        x = np.concatenate([observed, *seen], axis=-1)
+        for layer in self.layers[:-1]:
+            x = np.maximum(x @ layer.kernel + layer.bias, np.float32(0.0))
+        return np.tanh(x @ self.layers[-1].kernel + self.layers[-1].bias)
+
+
+def load_policy(name: str | Path = "phase2") -> NumpyPolicy:
+    """Load an agent of ours by name or folder, see ``find_agent``.
+
+    Raises:
+        SettingsError: there is no such agent.
+        DamagedFileError: its files are damaged.
+
+    """
+    folder = find_agent(name)
+    record = read_agent_record(folder)
+    try:
+        return from_arrays(archive.read_arrays(folder), record, str(name))
+    except DamagedFileError as error:
+        raise DamagedFileError(f"{folder}: {error}") from None
+
+
+def from_arrays(arrays: Mapping[str, np.ndarray], record: Record, name: str) -> NumpyPolicy:
+    """Take the deterministic policy out of the arrays of an agent's folder.
+
+    Raises:
+        DamagedFileError: an array is missing, or has another shape or type than the record's network.
+
+    """
+    layers = []
+    for number, (inputs, outputs) in enumerate(_shapes(record.network)):
+        kernel, bias = layer_names(number)
+        layers.append(Layer(_array(arrays, kernel, (inputs, outputs)), _array(arrays, bias, (outputs,))))
+    # The other half of the last layer is the spread of the actions, which only training needs.
+    layers[-1] = Layer(layers[-1].kernel[:, :ACTION_SIZE], layers[-1].bias[:ACTION_SIZE])
+    if len(arrays) != 2 * len(layers):
+        raise DamagedFileError(f"{len(arrays)} arrays, but the network of the record has {2 * len(layers)}")
+    return NumpyPolicy(views(record.network), tuple(layers), record, name)
+
+
+def exported_zone_count(network: NetworkConfig, scenario: ScenarioConfig) -> int:
+    """Zones that an exported controller is told of: all there may be, of which the policy sees the nearest."""
+    return max(network.observed_zones, scenario.max_zones)
+
+
+def layer_names(number: int) -> tuple[str, str]:
+    """Names of a layer's kernel and bias among the arrays of an agent."""
+    layer = f"params/Mlp_0/Dense_{number}"
+    return f"{layer}/kernel", f"{layer}/bias"
+
+
+def _shapes(network: NetworkConfig) -> list[tuple[int, int]]:
+    encoded = size(network.observed_zones) + sum(stop - start for start, stop, _ in views(network))
+    sizes = (encoded, *network.hidden_sizes, 2 * ACTION_SIZE)
+    return list(itertools.pairwise(sizes))
+
+
+def _array(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...]) -> np.ndarray:
+    if name not in arrays:
+        raise DamagedFileError(f"the array {name} is missing")
+    found = arrays[name]
+    if found.shape != shape or found.dtype != np.float32:
+        raise DamagedFileError(f"{name} must be float32{shape}, got {found.dtype}{found.shape}")
+    return found

@@ -1,0 +1,1 @@
+"""The command line: koz train, evaluate, fly, view, export, ..."""

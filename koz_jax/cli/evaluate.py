@@ -1,0 +1,148 @@
+"""``koz evaluate``: judge a controller by Monte Carlo."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from koz_jax.cli import invocation
+from koz_jax.cli.exit_status import exit_status
+from koz_jax.cli.flags import parsing
+from koz_jax.cli.flags.flight import AgentFlags, FlightFlags
+from koz_jax.cli.flags.process import ProcessFlags
+from koz_jax.errors import SettingsError
+
+if TYPE_CHECKING:
+    from koz_jax.config.task import TaskConfig
+    from koz_jax.control.base import TaskController
+    from koz_jax.evaluation.monte_carlo import MonteCarlo
+
+
+class EvaluateFlags(ProcessFlags, FlightFlags, AgentFlags):
+    """Fly a trained agent, or another controller, over many random cases; print the paper's table beside its own."""
+
+    json_file: Path | None = parsing.named("json", "Write the results as JSON.")
+    csv: Path | None = None
+    """Write a row per case."""
+    partial: Path | None = None
+    """Keep finished blocks of cases in this folder; the same command goes on from them when it was interrupted.
+    Several processes need one, in which each puts its share of the blocks."""
+    figures: Path | None = None
+    """Draw the Monte Carlo figures into this folder, as PNG and PDF (needs the extra viz)."""
+    replay_case: int | None = None
+    """Fly only this case of the draw, and write its history."""
+    history: Path | None = None
+    """File for --replay-case; by default case-I.csv."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Evaluate and print.  Returns the exit status."""
+    return exit_status(lambda: _evaluate(parsing.parse(EvaluateFlags, argv, invocation.command("evaluate"))))
+
+
+def _evaluate(asked: EvaluateFlags) -> int:
+    # jax is imported only now: --help and flags that do not exist are answered at once.
+    from koz_jax.storage import processes, runtime
+
+    if asked.replay_case is not None and asked.coordinator is not None:
+        raise SettingsError(f"replay_case: is flown by one process, got {asked.replay_case} with --coordinator")
+    runtime.configure()
+    asked.join()
+    agent, task = processes.all_or_none(lambda: _prepare(asked))
+    if asked.replay_case is not None:
+        _fly_case(agent, task, asked, asked.replay_case)
+    else:
+        _monte_carlo(agent, task, asked)
+    return 0
+
+
+def _prepare(asked: EvaluateFlags) -> tuple[TaskController, TaskConfig]:
+    """Load who flies, and refuse what cannot be flown or written."""
+    from koz_jax.config.task import check_feasible
+
+    agent = asked.load()
+    task = asked.task(agent)
+    check_feasible(task, asked.max_angle_deg)
+    _check_outputs(asked)  # last, since it makes a folder
+    return agent, task
+
+
+def _history_path(asked: EvaluateFlags) -> Path:
+    return asked.history or Path(f"case-{asked.replay_case}.csv")
+
+
+def _check_outputs(asked: EvaluateFlags) -> None:
+    """Refuse files that cannot be written, or that the rest of the command line leaves empty."""
+    from koz_jax.storage import files
+
+    outputs = {"json": asked.json_file, "csv": asked.csv}
+    if asked.replay_case is None:
+        if asked.history is not None:
+            raise SettingsError(f"history: is written by --replay-case only, got {asked.history} without it")
+    else:
+        _check_one_case(asked, asked.replay_case, {**outputs, "partial": asked.partial})
+        outputs["history"] = _history_path(asked)
+    for name, path in outputs.items():
+        if path is not None:
+            files.check_writable(name, path)
+    if asked.figures is not None:
+        from koz_jax.figures import style  # noqa: F401  without matplotlib, say so before the flight
+
+        files.make_folder("figures", asked.figures)
+
+
+def _check_one_case(asked: EvaluateFlags, case: int, outputs: dict[str, Path | None]) -> None:
+    """Refuse, with a single case, what is of many."""
+    for name, path in outputs.items():
+        if path is not None:
+            raise SettingsError(f"{name}: is not written with --replay-case, which writes --history; got {path}")
+    if asked.figures is not None:
+        raise SettingsError(
+            f"figures: are of many cases, and not drawn with --replay-case; got {asked.figures}. One case is drawn by"
+            f" {invocation.command('fly')} --case {case} --seed {asked.seed}"
+        )
+    if not 0 <= case < asked.cases:
+        raise SettingsError(f"replay_case: must be from 0 to cases - 1 = {asked.cases - 1}, got {case}")
+
+
+def _fly_case(agent: TaskController, task: TaskConfig, asked: EvaluateFlags, case: int) -> None:
+    from koz_jax.evaluation import cases, tables
+    from koz_jax.storage import files
+
+    history, result = cases.fly_case(agent, case, asked.config(), task)
+    path = _history_path(asked)
+    files.write_text(path, tables.history_csv(history, task))
+    print(tables.describe_case(case, result))
+    print(f"history: {path}")
+
+
+def _monte_carlo(agent: TaskController, task: TaskConfig, asked: EvaluateFlags) -> None:
+    from koz_jax.evaluation import monte_carlo
+    from koz_jax.storage import processes
+
+    flown = monte_carlo.run_cases(agent, task, asked.config(), partial=asked.partial)
+    # The others wait for the first, which reports.
+    label = asked.label(agent)
+    processes.all_or_none(lambda: None if asked.process > 0 else _report(flown, task, label, asked))
+
+
+def _report(flown: MonteCarlo, task: TaskConfig, label: str, asked: EvaluateFlags) -> None:
+    from koz_jax.evaluation import monte_carlo, tables
+    from koz_jax.evaluation.summary import summarise, table
+    from koz_jax.storage import files
+
+    summary = summarise(flown.results)
+    print(table(summary, asked.cases, label, asked.shield))
+    print(f"compiled in {flown.compile_s:.1f} s, flown in {flown.wall_s:.1f} s")
+    if asked.json_file:
+        files.write_json(asked.json_file, monte_carlo.report(flown, summary))
+    if asked.csv:
+        files.write_text(asked.csv, tables.cases_csv(flown.results))
+    if asked.figures:
+        from koz_jax.figures import monte_carlo as drawn
+        from koz_jax.figures import style
+
+        title = f"{style.short_name(label)}: {asked.cases} random cases, seed {asked.seed}"
+        for path in drawn.write(asked.figures, flown.results, task, title):
+            print(f"figure: {path}")

@@ -1,0 +1,56 @@
+"""``koz export``: write a trained agent for other programs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+from tyro.conf import Positional
+
+from koz_jax.cli import invocation
+from koz_jax.cli.exit_status import exit_status
+from koz_jax.cli.flags import parsing
+from koz_jax.cli.flags.flight import AGENT
+from koz_jax.config.base import MarginDeg, Settings
+from koz_jax.config.shield import ShieldConfig
+
+
+class ExportFlags(Settings):
+    """Write a trained agent as C99 source, ONNX, or StableHLO."""
+
+    agent: Positional[str] = Field(description=f"Who is exported: {AGENT}.")
+    to: Literal["c", "onnx", "stablehlo"]
+    """c: C99 with a self-test; onnx: a graph for onnxruntime; stablehlo: a program for XLA and jax.export."""
+    out: Path
+    """Folder to write into; the files of an earlier export to the same format are replaced."""
+    shield: bool = False
+    """Also write the shield, which keeps the boresight out of every zone; for --to c."""
+    shield_margin_deg: MarginDeg = parsing.same_as(ShieldConfig, "margin_deg")
+
+    @model_validator(mode="after")
+    def _of_the_shield(self) -> Self:
+        if self.shield and self.to != "c":
+            raise ValueError(f"shield: is exported as C only, got --to {self.to}")
+        if not self.shield and self.shield_margin_deg != ShieldConfig().margin_deg:
+            raise ValueError(f"shield_margin_deg: needs --shield, got {self.shield_margin_deg} without it")
+        return self
+
+
+def main(argv: Sequence[str]) -> int:
+    """Export.  Returns the exit status."""
+    return exit_status(lambda: _export(parsing.parse(ExportFlags, argv, invocation.command("export"))))
+
+
+def _export(asked: ExportFlags) -> int:
+    # jax is imported only now: --help and flags that do not exist are answered at once.
+    from koz_jax.agents.agent import load_agent
+    from koz_jax.export.files import export, write_files
+    from koz_jax.storage.files import make_folder
+
+    make_folder("out", asked.out)
+    shield = ShieldConfig(margin_deg=asked.shield_margin_deg) if asked.shield else None
+    for path in write_files(asked.out, export(load_agent(asked.agent), asked.to, shield)):
+        print(path)
+    return 0

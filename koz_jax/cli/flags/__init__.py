@@ -1,0 +1,1 @@
+"""Settings as command line flags, and those that commands share."""

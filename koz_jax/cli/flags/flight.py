@@ -1,0 +1,121 @@
+"""Flags that commands share which fly cases: who flies, which cases, under what conditions.  Imports no jax.
+
+Names, units, defaults and help come from the settings that the flags fill in.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal, Self
+
+from pydantic import Field, model_validator
+
+from koz_jax.agents.record import shipped_agents
+from koz_jax.cli.flags.parsing import agents_own, same_as
+from koz_jax.config.base import MarginDeg, NonNegativeFloat, Settings, ZoneCount
+from koz_jax.config.monte_carlo import CaseConfig, MonteCarloConfig
+from koz_jax.config.shield import CERTAIN, ShieldConfig, UncertaintyConfig
+from koz_jax.config.task import ScenarioConfig, TaskConfig
+from koz_jax.control.registry import ADVERSARIAL, CLASSICAL
+
+if TYPE_CHECKING:
+    from koz_jax.control.base import TaskController
+
+AGENTS = f"shipped agents by name ({', '.join(shipped_agents())}), folders of runs or of agents, or SAC zips of SB3"
+AGENT = (
+    f"a shipped agent by name ({', '.join(shipped_agents())}), the folder of a run or of an agent, or a SAC zip of"
+    " Stable-Baselines3"
+)
+CONTROLLERS = (
+    f"{', '.join(CLASSICAL)}; one that does its worst: {', '.join(ADVERSARIAL)}; or path/to/file.py:CLASS, a class of"
+    " your own"
+)
+
+
+class AgentFlags(Settings):
+    """Who flies."""
+
+    agent: str = Field(default="phase2", description=f"Who flies: {AGENT}.")
+    controller: str | None = Field(
+        default=None, description=f"Fly this on the agent's task in place of the agent: {CONTROLLERS}."
+    )
+
+    def load(self) -> TaskController:
+        """Load who flies.
+
+        Raises:
+            SettingsError: there is no such agent or controller.
+
+        """
+        from koz_jax.agents.agent import load_agent
+        from koz_jax.control.registry import load_controller
+
+        agent = load_agent(self.agent)
+        return agent if self.controller is None else load_controller(self.controller, agent.task)
+
+
+class _RuleFlags(Settings):
+    """How the task is drawn and judged, and whether it is shielded."""
+
+    infeasible_zone: Literal["resample", "shrink"] | None = agents_own(ScenarioConfig, "infeasible_zone")
+    zones: ZoneCount | None = None
+    """Number of zones of every case; by default the agent's."""
+    max_rate_deg: NonNegativeFloat | None = agents_own(ScenarioConfig, "max_rate_deg")
+    angle_convention: Literal["full", "half"] | None = agents_own(TaskConfig, "angle_convention")
+    shield: bool = False
+    """Fly under the shield, which keeps the boresight out of every zone whatever the controller asks for."""
+    shield_margin_deg: MarginDeg = same_as(ShieldConfig, "margin_deg")
+    robust: bool = False
+    """Make the shield withstand the errors that are flown with, which the next four flags set."""
+
+
+class FlightFlags(UncertaintyConfig, _RuleFlags, CaseConfig):
+    """Which cases are flown, and how."""
+
+    @model_validator(mode="after")
+    def _of_the_shield(self) -> Self:
+        if not self.shield:
+            if self.robust:
+                raise ValueError("robust: is of the shield, and needs --shield")
+            if self.shield_margin_deg != ShieldConfig().margin_deg:
+                raise ValueError(f"shield_margin_deg: needs --shield, got {self.shield_margin_deg} without it")
+        if self.robust and self.uncertainty == CERTAIN:
+            raise ValueError("robust: needs an error to withstand, such as --inertia-error 0.1")
+        return self
+
+    @property
+    def uncertainty(self) -> UncertaintyConfig:
+        """Errors to fly with."""
+        return UncertaintyConfig(**self.model_dump(include={*UncertaintyConfig.model_fields}))
+
+    @property
+    def shield_config(self) -> ShieldConfig | None:
+        """The shield to fly under, if one is asked for."""
+        if not self.shield:
+            return None
+        return ShieldConfig(
+            margin_deg=self.shield_margin_deg, error_bounds=self.uncertainty if self.robust else CERTAIN
+        )
+
+    def config(self) -> MonteCarloConfig:
+        """Which cases are flown, and how."""
+        return MonteCarloConfig(
+            **self.model_dump(include={*CaseConfig.model_fields}),
+            shield=self.shield_config,
+            uncertainty=None if self.uncertainty == CERTAIN else self.uncertainty,
+        )
+
+    def task(self, agent: TaskController) -> TaskConfig:
+        """What is flown: the task that a controller was made for, with the changes that the flags ask for.
+
+        Raises:
+            SettingsError: the shield has no torque for what it is to withstand.
+
+        """
+        task = agent.task.with_rules(self.angle_convention, self.infeasible_zone, self.zones, self.max_rate_deg)
+        if self.shield_config is not None:
+            self.shield_config.check(task.spacecraft.torque_limits)
+        return task
+
+    def label(self, agent: TaskController) -> str:
+        """Who flies, for tables and titles."""
+        return f"{agent.name} + shield" if self.shield else agent.name

@@ -1,0 +1,134 @@
+"""Settings as command line flags.
+
+The flags are filled in unchecked, then the settings are validated as a whole: an error names the full field, such as
+``task.scenario.max_half_angle_deg``, and all wrong values are reported at once, each in a line.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, TypeVar
+
+import tyro
+from pydantic import Field, ValidationError
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+from koz_jax.config.base import Settings
+from koz_jax.errors import SettingsError, explain
+
+Flags = TypeVar("Flags", bound=Settings)
+SettingsType = TypeVar("SettingsType", bound=Settings)
+
+_REGISTRY = ConstructorRegistry()
+
+
+def parse(flags: type[Flags], argv: Sequence[str], prog: str) -> Flags:
+    """Read ``argv`` into settings whose fields are flags; prints and exits for ``--help`` and for what is no flag.
+
+    Args:
+        flags: the settings; their documentation heads the help.  Fields of sections have the section's name in front,
+            and those of type ``tyro.conf.Positional`` are given by their place.
+        argv: the arguments.
+        prog: name of the command in the help.
+
+    Raises:
+        SettingsError: a value is not allowed.
+
+    """
+    found = tyro.cli(_plain(flags, {}), args=argv, prog=prog, registry=_REGISTRY)
+    return _validated((flags, found))[0]
+
+
+def parse_with(
+    flags: type[Flags], settings: SettingsType, argv: Sequence[str], prog: str, helps: Mapping[str, str]
+) -> tuple[Flags, SettingsType]:
+    """``parse`` flags together with other settings.
+
+    settings: to begin from; helps: texts in place of the descriptions of some of their fields.
+    """
+    plain = _plain(settings, helps)
+    parts = [("flags", _plain(flags, {})), ("settings", plain)]
+    fields = [(name, Annotated[part, tyro.conf.arg(name="")], part()) for name, part in parts]
+    everything = dataclasses.make_dataclass("Arguments", fields, frozen=True)
+    everything.__doc__ = flags.__doc__
+    found = tyro.cli(everything, args=argv, prog=prog, registry=_REGISTRY)
+    read, changed = _validated((flags, found.flags), (type(settings), found.settings))
+    return read, changed
+
+
+def same_as(settings: type[Settings], name: str) -> Any:
+    """A field with the default and the description of another one."""
+    field = settings.model_fields[name]
+    return Field(field.default, description=field.description)
+
+
+def named(flag: str, description: str) -> Any:
+    """An optional field whose flag has a name that the settings cannot have themselves."""
+    return Field(None, alias=flag, description=description)
+
+
+def agents_own(settings: type[Settings], name: str) -> Any:
+    """A field with the description of another one; None, the default, leaves it as the agent has it."""
+    description = settings.model_fields[name].description or ""
+    return Field(default=None, description=f"{description.rstrip('.')}; by default the agent's.")
+
+
+def _validated(*parts: tuple[type[Settings], Any]) -> tuple[Any, ...]:
+    """Check what was filled in.  parts: settings, and what was found for them."""
+    settings, wrong = [], []
+    for kind, found in parts:
+        try:
+            settings.append(kind.model_validate(_values(found)))
+        except ValidationError as error:
+            wrong.append(explain(error))
+    if wrong:
+        raise SettingsError("\n".join(wrong))
+    return tuple(settings)
+
+
+def _values(found: Any) -> dict[str, Any]:
+    values = {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
+    return {name: _values(value) if dataclasses.is_dataclass(value) else value for name, value in values.items()}
+
+
+def _plain(settings: Settings | type[Settings], helps: Mapping[str, str]) -> type[Any]:
+    """A dataclass like settings, with their values as defaults, but without validation; sections likewise."""
+    kind = settings if isinstance(settings, type) else type(settings)
+    fields = []
+    for name, field in kind.model_fields.items():
+        annotation = Annotated[
+            (field.annotation, *field.metadata, tyro.conf.arg(help=helps.get(name) or field.description))
+        ]
+        if field.is_required() and isinstance(settings, type):
+            fields.append((field.alias or name, annotation))
+            continue
+        value = field.get_default() if isinstance(settings, type) else getattr(settings, name)
+        if isinstance(value, Settings):
+            section = _plain(value, {})
+            annotation, value = section, section()
+        fields.append((field.alias or name, annotation, value))
+    plain = dataclasses.make_dataclass(kind.__name__, fields, frozen=True)
+    plain.__doc__ = kind.__doc__
+    return plain
+
+
+@_REGISTRY.primitive_rule
+def _whole_number(type_info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """Whole numbers may be written as 10_000 or 1e4; what is none is left to the validation, which names the field."""
+    if type_info.type is not int:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="INT",
+        instance_from_str=lambda words: _number(words[0]),
+        is_instance=lambda value: isinstance(value, int) and not isinstance(value, bool),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+def _number(word: str) -> int | float | str:
+    for kind in (int, float):
+        try:
+            return kind(word)
+        except ValueError:
+            pass
+    return word

@@ -1,0 +1,52 @@
+"""The console command ``koz``: finds the sub-command, and imports nothing but that."""
+
+import importlib
+import sys
+from collections.abc import Sequence
+
+from koz_jax.cli import invocation
+
+# Sub-commands: what each does.  The module of the same name in this folder has its ``main``.
+COMMANDS = {
+    "train": "train an agent, or go on with a run",
+    "evaluate": "fly an agent or another controller over many random cases; print the paper's table beside its own",
+    "fly": "fly one maneuver and draw it",
+    "view": "fly one maneuver with several agents, and write it as a 3-D page that opens offline",
+    "export": "write an agent as C, ONNX or StableHLO",
+    "tune": "tune the gains of a classical controller",
+    "agents": "list the agents inside the package",
+    "curves": "draw the learning curves of runs",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a sub-command.  argv: by default what was typed.  Returns the exit status."""
+    name, *others = [*(sys.argv[1:] if argv is None else argv)] or ["--help"]
+    if name in COMMANDS:
+        return importlib.import_module(f"koz_jax.cli.{name}").main(others)
+    if name in ("-h", "--help"):
+        print(_usage())
+        return 0
+    if name == "--version":
+        from koz_jax.config.version import version
+
+        print(f"koz_jax {version()}")
+        return 0
+    print(f"error: command: must be one of {', '.join(COMMANDS)}; got {name!r}", file=sys.stderr)
+    return 2
+
+
+def _usage() -> str:
+    koz = invocation.command("").strip()
+    width = max(map(len, COMMANDS))
+    return "\n".join(
+        [
+            f"usage: {koz} COMMAND [OPTIONS]",
+            "",
+            "Keep-out-zone attitude control of a spacecraft, learned end to end.",
+            "",
+            *(f"  {name:{width}}  {text}" for name, text in COMMANDS.items()),
+            "",
+            f"{koz} COMMAND --help describes the options of a command.",
+        ]
+    )

@@ -1,0 +1,158 @@
+"""``koz train``: train an agent, or go on with a run."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Self
+
+from pydantic import Field, model_validator
+
+from koz_jax.cli import invocation
+from koz_jax.cli.exit_status import exit_status
+from koz_jax.cli.flags import parsing
+from koz_jax.cli.flags.process import ProcessFlags
+from koz_jax.config.base import CaseCount, PositiveInt
+from koz_jax.config.presets import PRESETS, preset
+from koz_jax.config.training import TrainConfig
+from koz_jax.errors import SettingsError
+
+if TYPE_CHECKING:
+    from koz_jax.agents.agent import Agent
+
+_HELPS = {"preset": f"Settings to begin from: {', '.join(PRESETS)}; every other flag changes one of them."}
+
+
+class TrainFlags(ProcessFlags):
+    """Train a controller that turns a spacecraft without looking into a keep-out zone."""
+
+    run: Path | None = None
+    """Folder of the run; by default a new one under runs/."""
+    resume: Path | None = None
+    """Go on exactly where the run in this folder stopped; takes all settings from it."""
+    start_from: Path | None = None
+    """Begin with the learner and the replay buffer of a snapshot, or of another run."""
+    cases: CaseCount = 10_000
+    """Monte Carlo cases of the table at the end."""
+    devices: PositiveInt = 1
+    """Divide the environments and the replay buffer among so many devices of each process (not with --seeds)."""
+    seeds: Annotated[int, Field(gt=0, le=1000)] = 1
+    """Train so many seeds, from --seed on, each on a core of its own; the best by evaluation is the run's agent."""
+
+    @model_validator(mode="after")
+    def _can_be_together(self) -> Self:
+        if self.devices > 1 and self.seeds > 1:
+            raise ValueError(f"devices: must be 1 with --seeds, got {self.devices}")
+        if self.coordinator is not None:
+            if self.seeds > 1:
+                raise ValueError(f"coordinator: is for one agent, not for --seeds {self.seeds}; got {self.coordinator}")
+            if self.run is None and self.resume is None:
+                raise ValueError("run: must be given where several processes write to one folder")
+        return self
+
+
+def parse(argv: Sequence[str]) -> tuple[TrainConfig, TrainFlags]:
+    """Read the command line into the run's configuration and the other flags.
+
+    Raises:
+        SettingsError: a value is not allowed.
+
+    """
+    prog = invocation.command("train")
+    first = argparse.ArgumentParser(prog=prog, add_help=False, allow_abbrev=False)
+    first.add_argument("--preset", nargs="?", const="")
+    first.add_argument("--resume", nargs="?", const="")
+    # With these a run may also be resumed.
+    for name in ("cases", "devices", "coordinator", "processes", "process"):
+        first.add_argument(f"--{name}", nargs="?")
+    chosen, others = first.parse_known_args(argv)
+    if chosen.preset is not None:
+        others += ["--preset", chosen.preset]
+    if chosen.resume is not None and others and not {"-h", "--help"} & set(argv):
+        raise SettingsError(f"resume: takes all settings from the run; remove {shlex.join(others)}")
+    begin_from = preset("fast" if chosen.preset is None else chosen.preset)
+    asked, config = parsing.parse_with(TrainFlags, begin_from, argv, prog, _HELPS)
+    return config, asked
+
+
+def main(argv: Sequence[str]) -> int:
+    """Train, evaluate, print the table.  Returns the exit status."""
+    return exit_status(lambda: _train(*parse(argv), invocation.typed("train", argv)))
+
+
+def _train(config: TrainConfig, asked: TrainFlags, command: str) -> int:
+    # jax is imported only now: a bad flag is refused before it costs a second.
+    from koz_jax.runs.folder import RunFolder
+    from koz_jax.runs.trainer import train
+    from koz_jax.storage import processes, runtime
+
+    new = Path("runs", time.strftime(f"{config.preset}-seed{config.seed}-%Y%m%d-%H%M%S"))
+    run = asked.resume or asked.run or new
+    if asked.seeds > 1 or (asked.resume is not None and os.path.isfile(run / "seeds.json")):
+        return _train_seeds(config, asked, run, command)
+    runtime.configure()
+    asked.join()
+    if asked.resume:
+        config = processes.all_or_none(RunFolder(run).read_config)
+    agent = train(
+        config,
+        run,
+        resume=asked.resume is not None,
+        start_from=asked.start_from,
+        devices=asked.devices,
+        command=command,
+    )
+    # The others wait for the first, which reports.
+    return processes.all_or_none(lambda: 0 if asked.process > 0 else _report(agent, config, asked.cases, run))
+
+
+def _report(agent: Agent | None, config: TrainConfig, cases: int, run: Path) -> int:
+    from koz_jax.evaluation import monte_carlo
+    from koz_jax.evaluation.summary import summarise, table
+    from koz_jax.runs.folder import RunFolder
+    from koz_jax.storage import files
+
+    if agent is None:
+        return _stopped(run)
+    shield = config.shielding.in_force
+    flown = monte_carlo.monte_carlo(agent, cases, shield=shield)
+    summary = summarise(flown.results)
+    files.write_json(RunFolder(run).evaluation, monte_carlo.report(flown, summary))
+    print(table(summary, cases, run.resolve().name + (" + shield" if shield else ""), shield is not None))
+    shielded = f"--shield --shield-margin-deg {shield.margin_deg:g} " if shield else ""
+    evaluate = invocation.command("evaluate")
+    print(f"\nlook further: {evaluate} --agent {shlex.quote(str(run))} {shielded}--csv cases.csv")
+    return 0
+
+
+def _stopped(run: Path) -> int:
+    print(f"stopped; go on with: {invocation.command('train')} --resume {shlex.quote(str(run))}", file=sys.stderr)
+    return 0
+
+
+def _train_seeds(config: TrainConfig, asked: TrainFlags, run: Path, command: str) -> int:
+    from koz_jax.runs import seeds
+    from koz_jax.storage import runtime
+
+    for name in ("devices", "processes"):
+        if getattr(asked, name) > 1:
+            raise SettingsError(f"{name}: must be 1 for several seeds, as in {run}; got {getattr(asked, name)}")
+    runtime.configure()
+    if asked.resume is None:
+        start_from = None if asked.start_from is None else str(asked.start_from.resolve())
+        plan = seeds.Plan(config=config, seeds=asked.seeds, start_from=start_from)
+        seeds.begin(run, plan)
+    else:
+        plan = seeds.read_plan(run)
+    if not seeds.train_all(run, plan, command=command):
+        return _stopped(run)
+    best, found = seeds.evaluate(run, plan, asked.cases)
+    print(seeds.table(found, asked.cases))
+    evaluate = invocation.command("evaluate")
+    print(f"\nthe best (seed {best.provenance.seed}): {evaluate} --agent {shlex.quote(str(run))}")
+    return 0

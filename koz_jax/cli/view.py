@@ -1,0 +1,82 @@
+"""``koz view``: a maneuver in 3-D."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pydantic import Field, PositiveFloat
+
+from koz_jax.cli import invocation
+from koz_jax.cli.exit_status import exit_status
+from koz_jax.cli.flags import parsing
+from koz_jax.cli.flags.flight import AGENTS, CONTROLLERS
+from koz_jax.cli.flags.one_case import OneCaseFlags
+from koz_jax.config.base import Settings
+
+if TYPE_CHECKING:
+    from koz_jax.control.base import TaskController
+
+
+class _AgentsFlags(Settings):
+    """Who flies."""
+
+    agent: tuple[str, ...] = Field(default=("phase1", "phase2"), description=f"Who flies: {AGENTS}.")
+    controller: str | None = Field(
+        default=None, description=f"Show this one too, on the first agent's task: {CONTROLLERS}."
+    )
+
+    def load(self) -> list[TaskController]:
+        """Load all who fly.
+
+        Raises:
+            SettingsError: there is no such agent or controller.
+
+        """
+        from koz_jax.agents.agent import load_agent
+        from koz_jax.control.registry import load_controller
+
+        flying: list[TaskController] = [load_agent(name) for name in self.agent]
+        if self.controller is not None:
+            flying.append(load_controller(self.controller, flying[0].task if flying else None))
+        return flying
+
+
+class ViewFlags(OneCaseFlags, _AgentsFlags):
+    """Show one maneuver as several agents fly it, side by side, in an HTML file that opens offline."""
+
+    seconds: PositiveFloat | None = None
+    """How much of the maneuver to show [s]; by default until soon after the last agent has settled."""
+    out: Path = Path("maneuver.html")
+    """The file to write."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Fly and write.  Returns the exit status."""
+    return exit_status(lambda: _view(parsing.parse(ViewFlags, argv, invocation.command("view"))))
+
+
+def _view(asked: ViewFlags) -> int:
+    # jax is imported only now: --help and flags that do not exist are answered at once.
+    from koz_jax.evaluation.tables import describe_result
+    from koz_jax.storage import files, runtime
+    from koz_jax.viewer import page
+    from koz_jax.viewer.maneuver import fly
+
+    page.check_count("agent", len(asked.agent) + (asked.controller is not None))
+    files.check_writable("out", asked.out)
+    page.plotly_library()
+    runtime.configure()
+    flying = asked.load()
+    tasks = [asked.task(agent) for agent in flying]
+    drawn = asked.scenario(tasks[0])
+    maneuvers = [
+        fly(agent, drawn, asked.label(agent), task=task, config=asked.config(), case=asked.case or 0)
+        for agent, task in zip(flying, tasks, strict=True)
+    ]
+    page.write_page(asked.out, maneuvers, f"Maneuver: {asked.what}", asked.seconds)
+    for maneuver in maneuvers:
+        print(f"{maneuver.label}: {describe_result(maneuver.result)}")
+    print(f"page: {asked.out} ({asked.out.stat().st_size / 1e6:.1f} MB; open it in a browser, no network needed)")
+    return 0

@@ -1,0 +1,1 @@
+"""Settings in degrees, validated once; imports no jax."""

@@ -1,0 +1,159 @@
+"""Named training configurations."""
+
+from koz_jax.config.base import constant
+from koz_jax.config.curriculum import CurriculumConfig, PhaseConfig
+from koz_jax.config.training import (
+    NO_ENCODING,
+    NetworkConfig,
+    RefineConfig,
+    SacConfig,
+    TrainConfig,
+)
+from koz_jax.errors import SettingsError
+
+
+def _paper() -> TrainConfig:
+    """The hyperparameters of Table 2, and what Stable-Baselines3 does where the paper is silent.
+
+    The paper does not say how long it trained.  Two million updates per phase take some hours on two cores.
+    """
+    return TrainConfig(
+        preset="paper",
+        network=NetworkConfig(hidden_sizes=(256, 256), encoding=NO_ENCODING),
+        sac=SacConfig(
+            batch_size=256,
+            buffer_size=1_000_000,
+            n_step=1,
+            soft_update=0.005,
+            target_entropy=-3.0,
+            initial_entropy_coefficient=1.0,
+            reward_scale=1.0,
+            policy_average=1.0,
+        ),
+        curriculum=CurriculumConfig(
+            phase1=PhaseConfig(
+                updates=2_000_000,
+                max_angle_deg=((0.0, 25.0), (0.75, 180.0)),
+                learning_rate=constant(1e-4),
+            ),
+            phase2=PhaseConfig(
+                updates=2_000_000,
+                min_angle_deg=constant(80.0),
+                max_angle_deg=((0.0, 80.0), (0.75, 180.0)),
+                zone_weight=constant(1.0),
+                learning_rate=constant(1e-4),
+            ),
+        ),
+        num_envs=1,
+        updates_per_step=1,
+        prefill_steps=100,
+        training_episode_seconds=100.0,
+        eval_every=50_000,
+        log_every=1_000,
+    )
+
+
+def _fast() -> TrainConfig:
+    """Beats the paper's table after some minutes on two CPU cores."""
+    return TrainConfig(
+        preset="fast",
+        network=NetworkConfig(hidden_sizes=(128, 128)),
+        sac=SacConfig(
+            batch_size=256,
+            buffer_size=512_000,
+            n_step=3,
+            initial_entropy_coefficient=0.1,
+            reward_scale=0.05,
+            policy_average=0.004,
+        ),
+        curriculum=CurriculumConfig(
+            phase1=PhaseConfig(
+                updates=40_000,
+                max_angle_deg=((0.0, 10.0), (0.75, 180.0)),
+                learning_rate=constant(5e-4),
+            ),
+            phase2=PhaseConfig(
+                updates=120_000,
+                min_angle_deg=constant(60.0),
+                zone_weight=((0.0, 0.5), (0.1, 2.0)),
+                zone_tightening_deg=constant(1.25),
+                zone_steepness=constant(2.0),
+                effort_weight=((0.0, 0.0), (0.1, 0.2), (0.5, 1.0)),
+                learning_rate=((0.0, 5e-4), (0.5, 5e-4), (1.0, 2.5e-5)),
+            ),
+        ),
+        refine=RefineConfig(iterations=400),
+        num_envs=512,
+        updates_per_step=8,
+        prefill_steps=20,
+        training_episode_seconds=40.0,
+        eval_every=10_000,
+        log_every=2_000,
+    )
+
+
+def _thorough() -> TrainConfig:
+    """The fast preset with more of everything; the shipped agents come from it."""
+    fast = _fast()
+    longer = fast.curriculum.phase2.model_copy(update={"updates": 360_000})
+    return fast.model_copy(
+        update={
+            "preset": "thorough",
+            "curriculum": fast.curriculum.model_copy(update={"phase2": longer}),
+            "refine": fast.refine.model_copy(update={"iterations": 3000, "scenarios": 256}),
+            "eval_cases": 4000,
+        }
+    )
+
+
+def _short() -> TrainConfig:
+    """The fast preset in less than half of its time, for a first look and for notebooks."""
+    fast = _fast()
+    # Effort comes late: in so short a phase, the agent must first find its way around the zone.
+    shorter = fast.curriculum.phase2.model_copy(
+        update={
+            "updates": 36_000,
+            "min_angle_deg": constant(0.0),
+            "effort_weight": ((0.0, 0.0), (0.5, 0.0), (1.0, 0.3)),
+        }
+    )
+    phase1 = fast.curriculum.phase1.model_copy(update={"updates": 36_000})
+    return fast.model_copy(
+        update={
+            "preset": "short",
+            "curriculum": fast.curriculum.model_copy(update={"phase1": phase1, "phase2": shorter}),
+            "refine": fast.refine.model_copy(update={"iterations": 100}),
+            "eval_every": 6_000,
+            "eval_cases": 200,
+            "refine_log_every": 10,
+            "refine_eval_every": 50,
+        }
+    )
+
+
+def _smoke() -> TrainConfig:
+    """Everything that a training does, in seconds: to see whether it runs, not to learn."""
+    short = _short()
+    phase1, phase2 = (
+        phase.model_copy(update={"updates": 1_600}) for phase in (short.curriculum.phase1, short.curriculum.phase2)
+    )
+    return short.model_copy(
+        update={
+            "preset": "smoke",
+            "curriculum": short.curriculum.model_copy(update={"phase1": phase1, "phase2": phase2}),
+            "refine": short.refine.model_copy(update={"iterations": 10, "scenarios": 8}),
+            "eval_every": 800,
+            "log_every": 400,
+            "refine_eval_every": 10,
+        }
+    )
+
+
+PRESETS = {config.preset: config for config in (_fast(), _short(), _smoke(), _thorough(), _paper())}
+
+
+def preset(name: str) -> TrainConfig:
+    """A preset by name."""
+    if name not in PRESETS:
+        raise SettingsError(f"preset: unknown preset {name!r}; allowed: {', '.join(PRESETS)}")
+    return PRESETS[name]

@@ -1,0 +1,258 @@
+"""Settings of training, declared and validated once.  Imports no jax: a bad setting costs no compute.
+
+All classes are frozen and hashable (they are static arguments of jitted functions) and go to and from JSON.
+Angles are in degrees here, where people write them, and in radians everywhere else.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Self
+
+from pydantic import model_validator
+
+from koz_jax.config.base import (
+    DeviationDeg,
+    Fraction,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    Seed,
+    Settings,
+    ZoneCount,
+    check_steps,
+)
+from koz_jax.config.curriculum import CurriculumConfig
+from koz_jax.config.shield import ShieldConfig
+from koz_jax.config.task import TaskConfig
+
+
+class EncodingConfig(Settings):
+    """Multi-resolution input encoding: the networks also see tanh(x / scale) of parts of the observation."""
+
+    attitude_scales: tuple[PositiveFloat, ...] = (0.005, 0.05)
+    """Scales for the vector part of q_e."""
+    rate_scales: tuple[PositiveFloat, ...] = (0.003, 0.03)
+    """Scales for the body rates [rad/s]."""
+    zone_margin_scales: tuple[PositiveFloat, ...] = (0.02, 0.1, 0.3)
+    """Scales for the margin to the zone [rad]."""
+
+
+NO_ENCODING = EncodingConfig(attitude_scales=(), rate_scales=(), zone_margin_scales=())
+
+
+class NetworkConfig(Settings):
+    """Shape of the policy and of each critic."""
+
+    hidden_sizes: tuple[PositiveInt, ...] = (256, 256)
+    """Units of each hidden layer (ReLU)."""
+    encoding: EncodingConfig = EncodingConfig()
+    """What the networks see besides the observation."""
+    observed_zones: ZoneCount = 1
+    """Zones in the observation, the nearest first."""
+
+
+class SacConfig(Settings):
+    """Soft Actor-Critic."""
+
+    batch_size: PositiveInt = 256
+    """Transitions per update."""
+    buffer_size: PositiveInt = 1_000_000
+    """Transitions that the replay buffer holds."""
+    n_step: PositiveInt = 1
+    """Rewards summed before the critic's own estimate takes over."""
+    soft_update: Fraction = 0.005
+    """tau: share of the critic that its target takes over per update."""
+    target_entropy: float = -3.0
+    """Entropy that the automatic coefficient steers to."""
+    initial_entropy_coefficient: PositiveFloat = 1.0
+    """Entropy coefficient (alpha) at the start."""
+    reward_scale: PositiveFloat = 1.0
+    """Factor on the reward before it reaches the critic."""
+    policy_average: Fraction = 1.0
+    """Share of the policy that the evaluated, averaged policy takes over per update; 1 evaluates the last policy."""
+
+
+class RefineConfig(Settings):
+    """Last stage: polish the policy by first-order gradients through the dynamics, over whole maneuvers."""
+
+    iterations: NonNegativeInt = 0
+    """Gradient steps; 0 leaves the stage out."""
+    scenarios: PositiveInt = 128
+    """Maneuvers per gradient step."""
+    horizon_seconds: PositiveFloat = 30.0
+    """Length of each maneuver [s]."""
+    learning_rate: PositiveFloat = 1e-3
+    """Learning rate at the start; it falls to zero along a cosine."""
+    max_gradient_norm: PositiveFloat = 0.03
+    """Larger gradients are scaled down to this norm.  Nearly all are: a maneuver that hesitates in front of the zone
+    has a huge gradient, which must not outvote the others."""
+    min_angle_deg: DeviationDeg = 30.0
+    """Smallest initial deviation [deg]."""
+    max_angle_deg: DeviationDeg = 180.0
+    """Largest initial deviation [deg]."""
+    pointing_scales_deg: tuple[PositiveFloat, ...] = (0.1, 3.0, 50.0)
+    """Scales of the pointing cost, sum of weight tanh(phi / scale) [deg]."""
+    pointing_weights: tuple[NonNegativeFloat, ...] = (4.0, 6.0, 1.0)
+    """Weight of each scale of the pointing cost, per step."""
+    effort_weight: NonNegativeFloat = 5.0
+    """Cost per step of the squared action: trades effort against time."""
+    zone_weight: NonNegativeFloat = 2.0
+    """Weight of the zone penalty."""
+    zone_tightening_deg: NonNegativeFloat = 1.0
+    """How much wider than it is the penalty sees the zone [deg]."""
+    zone_steepness: PositiveFloat = 2.0
+    """Factor on alpha, the decay of the zone penalty."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.min_angle_deg > self.max_angle_deg:
+            raise ValueError(
+                f"min_angle_deg must be at most max_angle_deg; got {self.min_angle_deg} and {self.max_angle_deg}"
+            )
+        if len(self.pointing_scales_deg) != len(self.pointing_weights):
+            raise ValueError(
+                "pointing_scales_deg and pointing_weights must have the same length; got"
+                f" {self.pointing_scales_deg} and {self.pointing_weights}"
+            )
+        return self
+
+
+class ShieldingConfig(Settings):
+    """Training under the shield, so that the agent learns to live with it."""
+
+    enabled: bool = False
+    """Put the shield between policy and actuators, in training and in its evaluations."""
+    intervention_cost: NonNegativeFloat = 0.0
+    """Cost per step of the norm of what the shield changes of the action; 0 does not penalise it."""
+    shield: ShieldConfig = ShieldConfig()
+    """The shield."""
+
+    @property
+    def in_force(self) -> ShieldConfig | None:
+        """The shield that the agent flies under, if it does."""
+        return self.shield if self.enabled else None
+
+
+class TrainConfig(Settings):
+    """One training run."""
+
+    preset: str = "custom"
+    """Settings to begin from: fast, thorough or paper; every other flag changes one of them."""
+    task: TaskConfig = TaskConfig()
+    """What is learned."""
+    network: NetworkConfig = NetworkConfig()
+    """What learns it."""
+    sac: SacConfig = SacConfig()
+    """How it learns."""
+    curriculum: CurriculumConfig
+    """In what order it learns."""
+    refine: RefineConfig = RefineConfig()
+    """How the result is polished."""
+    shielding: ShieldingConfig = ShieldingConfig()
+    """Whether it learns under the shield."""
+    num_envs: PositiveInt = 1
+    """Environments that run in parallel."""
+    updates_per_step: PositiveInt = 1
+    """Gradient updates for each step of all environments."""
+    prefill_steps: NonNegativeInt = 100
+    """Steps of all environments with random actions before the first update."""
+    training_episode_seconds: PositiveFloat = 100.0
+    """Training episodes are cut (truncated, not terminated) after this time [s]."""
+    eval_every: PositiveInt = 10_000
+    """Updates between evaluations and checkpoints; a phase ends with an evaluation in any case."""
+    log_every: PositiveInt = 1000
+    """Updates between lines of the log; also how long an interrupt may have to wait."""
+    refine_log_every: PositiveInt = 20
+    """Refinement iterations between lines of the log."""
+    refine_eval_every: PositiveInt = 100
+    """Refinement iterations between evaluations and checkpoints."""
+    eval_cases: PositiveInt = 1000
+    """Fixed scenarios of each evaluation."""
+    eval_min_angle_deg: DeviationDeg = 80.0
+    """Smallest initial deviation in evaluation [deg]."""
+    eval_max_angle_deg: DeviationDeg = 180.0
+    """Largest initial deviation in evaluation [deg]."""
+    seed: Seed = 0
+    """Seed of everything random in the run."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.curriculum.updates == 0:
+            raise ValueError("curriculum must have at least one update in phase1.updates + phase2.updates; got 0")
+        if self.curriculum.updates >= 2**31:
+            raise ValueError(
+                "curriculum must have less than 2^31 updates in phase1.updates + phase2.updates; got"
+                f" {self.curriculum.updates}"
+            )
+        if self.refine.iterations and not self.curriculum.phase2.updates:
+            raise ValueError(
+                "refine.iterations must be 0 where curriculum.phase2.updates is 0: refinement polishes the agent of"
+                f" phase 2; got {self.refine.iterations}"
+            )
+        if self.sac.batch_size > self.sac.buffer_size:
+            raise ValueError(
+                f"sac.batch_size must be at most sac.buffer_size; got {self.sac.batch_size} and {self.sac.buffer_size}"
+            )
+        if self.buffer_steps < self.sac.n_step:
+            raise ValueError(
+                f"sac.buffer_size must hold sac.n_step = {self.sac.n_step} steps of num_envs = {self.num_envs}"
+                f" environments; got {self.sac.buffer_size}"
+            )
+        if self.prefill_steps < self.sac.n_step:
+            raise ValueError(f"prefill_steps must be at least sac.n_step = {self.sac.n_step}; got {self.prefill_steps}")
+        lengths = {
+            "curriculum.phase1.updates": self.curriculum.phase1.updates,
+            "curriculum.phase2.updates": self.curriculum.phase2.updates,
+            "eval_every": self.eval_every,
+            "log_every": self.log_every,
+        }
+        for name, value in lengths.items():
+            if value % self.updates_per_step:
+                raise ValueError(
+                    f"{name} must be a multiple of updates_per_step = {self.updates_per_step}; got {value}"
+                )
+        check_steps("training_episode_seconds", self.training_episode_seconds, self.task.step_seconds)
+        check_steps("refine.horizon_seconds", self.refine.horizon_seconds, self.task.step_seconds)
+        if self.eval_min_angle_deg > self.eval_max_angle_deg:
+            raise ValueError(
+                "eval_min_angle_deg must be at most eval_max_angle_deg; got"
+                f" {self.eval_min_angle_deg} and {self.eval_max_angle_deg}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _can_be_shielded(self) -> Self:
+        if self.shielding.in_force:
+            self.shielding.in_force.check(self.task.spacecraft.torque_limits)
+        return self
+
+    def to_json(self) -> str:
+        """What ``config.json`` of a run holds."""
+        return self.model_dump_json(indent=2) + "\n"
+
+    @property
+    def sha256(self) -> str:
+        """Hash of all settings: that of the file ``config.json``."""
+        return hashlib.sha256(self.to_json().encode()).hexdigest()
+
+    @property
+    def length(self) -> int:
+        """Length of the run: gradient updates, then refinement iterations."""
+        return self.curriculum.updates + self.refine.iterations
+
+    @property
+    def training_episode_steps(self) -> int:
+        """Steps after which a training episode is truncated."""
+        return round(self.training_episode_seconds / self.task.step_seconds)
+
+    @property
+    def refine_steps(self) -> int:
+        """Steps of a maneuver in refinement."""
+        return round(self.refine.horizon_seconds / self.task.step_seconds)
+
+    @property
+    def buffer_steps(self) -> int:
+        """Steps of all environments that the replay buffer holds."""
+        return self.sac.buffer_size // self.num_envs

@@ -1,0 +1,1 @@
+"""What decides: trained policies, classical and adversarial controllers, and the shield."""

@@ -1,0 +1,95 @@
+"""Controllers that do their worst, to try the shield: none of them knows what is good for the telescope."""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from koz_jax.control.base import Memoryless
+from koz_jax.task import dynamics, pointing_constraints, rotations
+from koz_jax.task.state import EnvState, Model, torque_limits
+
+
+class _Drawn(struct.PyTreeNode):
+    """An action that is held, and the key for the next one."""
+
+    key: jax.Array
+    action: jax.Array  # (3,)
+
+
+class Random(struct.PyTreeNode):
+    """Uniform torque in the box, a new one at every step."""
+
+    def begin(self, state: EnvState, model: Model, key: jax.Array) -> jax.Array:
+        """Remember the key."""
+        return key
+
+    def decide(self, state: EnvState, model: Model, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Draw an action (3,)."""
+        key, key_action = jax.random.split(memory)
+        return jax.random.uniform(key_action, (3,), minval=-1.0, maxval=1.0), key
+
+
+class BangBang(struct.PyTreeNode):
+    """Full throttle: a random corner of the torque box, held for some seconds at a time."""
+
+    hold: jax.Array = struct.field(default_factory=lambda: jnp.float32(4.0))  # () [s]
+
+    def begin(self, state: EnvState, model: Model, key: jax.Array) -> _Drawn:
+        """Draw the first corner."""
+        return self._draw(key)
+
+    def decide(self, state: EnvState, model: Model, memory: _Drawn) -> tuple[jax.Array, _Drawn]:
+        """Action (3,): the corner that is held."""
+        steps = jnp.maximum(jnp.round(self.hold / model.dt).astype(jnp.int32), 1)
+        again = (state.steps % steps == 0) & (state.steps > 0)
+        fresh = self._draw(memory.key)
+        memory = jax.tree.map(lambda new, old: jnp.where(again, new, old), fresh, memory)
+        return memory.action, memory
+
+    @staticmethod
+    def _draw(key: jax.Array) -> _Drawn:
+        key, key_action = jax.random.split(key)
+        return _Drawn(key, jax.random.rademacher(key_action, (3,), jnp.float32))
+
+
+class Adversary(Memoryless):
+    """Steers the boresight into the first zone with all its might, damping only what does not lead there."""
+
+    def decide(self, state: EnvState, model: Model, memory: None) -> tuple[jax.Array, None]:
+        """Action (3,) at the edge of the box."""
+        return _full(_towards_zone(state) - _aside(state), state, model), memory
+
+
+class SpinUp(Memoryless):
+    """Builds up rate for some seconds about an axis of the body, then steers into the zone."""
+
+    spin_seconds: jax.Array = struct.field(default_factory=lambda: jnp.float32(20.0))  # () [s]
+    axis_B: jax.Array = struct.field(default_factory=lambda: jnp.array([1.0, 1.0, 1.0]))  # (3,) spun up about
+
+    def decide(self, state: EnvState, model: Model, memory: None) -> tuple[jax.Array, None]:
+        """Action (3,)."""
+        seconds = state.steps * model.dt
+        steer = _full(_towards_zone(state), state, model)
+        return jnp.where(seconds < self.spin_seconds, self.axis_B, steer), memory
+
+
+def _towards_zone(state: EnvState) -> jax.Array:
+    """Body axis (3,) about which a turn brings the boresight to the first zone, of unit length."""
+    first = jax.tree.map(lambda leaf: leaf[0], state.scenario.constraints)
+    turn_B = rotations.cross(first.boresight_B, pointing_constraints.axis_B(state.body.q_BN, first))
+    return turn_B / jnp.maximum(rotations.norm(turn_B), 1e-6)
+
+
+def _aside(state: EnvState) -> jax.Array:
+    """Part of the rate (3,) [rad/s] that does not lead to the zone, weighed so that it is damped in seconds."""
+    towards_B = _towards_zone(state)
+    omega_B = state.body.omega_BN_B
+    return 10.0 * (omega_B - rotations.dot(omega_B, towards_B) * towards_B)
+
+
+def _full(acceleration_B: jax.Array, state: EnvState, model: Model) -> jax.Array:
+    """Largest action (3,) within the box that accelerates along a body axis (3,)."""
+    torque_B = dynamics.matvec(model.inertia_B, acceleration_B)
+    limits = torque_limits(state, model)
+    shares = torque_B / (limits.box_B / limits.scale)
+    return shares / jnp.maximum(jnp.max(jnp.abs(shares)), 1e-9)

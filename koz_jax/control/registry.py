@@ -1,0 +1,69 @@
+"""Controllers by name: the built-in ones, and any class in a file of one's own.  Imports jax only to load one."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+from typing import TYPE_CHECKING, NamedTuple
+
+from koz_jax.config.task import TaskConfig
+from koz_jax.errors import SettingsError
+
+if TYPE_CHECKING:
+    from koz_jax.control.base import Controller
+
+
+class BuiltIn(NamedTuple):
+    """Where a built-in controller is, and what it is for."""
+
+    module: str  # in koz_jax.control
+    class_name: str
+    adversarial: bool = False  # does its worst, to try the shield
+
+
+BUILT_IN = {
+    "pd": BuiltIn("quaternion_feedback", "QuaternionFeedback"),
+    "potential": BuiltIn("potential", "PotentialFeedback"),
+    "sliding": BuiltIn("sliding_mode", "PotentialSliding"),
+    "planner": BuiltIn("path_planner", "PathPlanner"),
+    "random": BuiltIn("adversarial", "Random", adversarial=True),
+    "bang_bang": BuiltIn("adversarial", "BangBang", adversarial=True),
+    "adversary": BuiltIn("adversarial", "Adversary", adversarial=True),
+    "spin_up": BuiltIn("adversarial", "SpinUp", adversarial=True),
+}
+
+CLASSICAL = tuple(name for name, entry in BUILT_IN.items() if not entry.adversarial)
+ADVERSARIAL = tuple(name for name, entry in BUILT_IN.items() if entry.adversarial)
+
+
+@dataclasses.dataclass(frozen=True)
+class NamedController:
+    """A controller that needs no training, with a name and a task: a ``TaskController``."""
+
+    name: str
+    controller: Controller
+    task: TaskConfig
+
+
+def load_controller(name: str, task: TaskConfig | None = None) -> NamedController:
+    """Make a controller with its default gains.
+
+    name: of a built-in one, or ``path/to/file.py:ClassName`` for a class of one's own, which is made without arguments
+        and called by the name of the class.
+    task: the task that it flies unless told otherwise; by default the paper's.
+
+    Raises:
+        SettingsError: there is no such controller, or it cannot fly; the message lists what is allowed.
+
+    """
+    flown = task or TaskConfig()
+    if ":" in name or name.endswith(".py"):
+        from koz_jax.control import from_file
+
+        path, _, class_name = name.rpartition(":")
+        return NamedController(class_name, from_file.load(path, class_name, flown), flown)
+    if name not in BUILT_IN:
+        raise SettingsError(f"controller: must be one of {', '.join(BUILT_IN)}, or FILE.py:CLASS; got {name!r}")
+    entry = BUILT_IN[name]
+    made = getattr(importlib.import_module(f"koz_jax.control.{entry.module}"), entry.class_name)
+    return NamedController(name, made(), flown)

@@ -1,1 +1,0 @@
-"""What flies the spacecraft, besides trained agents."""

@@ -1,0 +1,1 @@
+"""Flying cases and judging them."""

@@ -1,0 +1,180 @@
+"""Flying maneuvers: one case at a time, either only measured or with its whole history."""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from koz_jax.control.base import Controller, Memory
+from koz_jax.task import reward
+from koz_jax.task.environment import Reorientation, Step
+from koz_jax.task.reward import RewardTerms
+from koz_jax.task.scenario import Scenario
+from koz_jax.task.state import EnvState, Truth, attitude_error, propagate
+
+
+class CaseResult(struct.PyTreeNode):
+    """What a maneuver is judged by (section 6 of the specification; Table 4 of the paper)."""
+
+    initial_angle: jax.Array  # () [rad] full rotation angle at the start
+    reward_terms: RewardTerms  # sum over the maneuver of each term
+    settling_time: jax.Array  # () [s] time after which phi stays within the accuracy; nan if it does not
+    control_effort: jax.Array  # () [N^2 m^2 s] integral of |tau|^2
+    control_accuracy: jax.Array  # () [rad] phi at the end
+    min_margin: jax.Array  # () [rad] smallest margin to any zone
+    settled: jax.Array  # () bool
+    violated: jax.Array  # () bool
+    intervention_rate: jax.Array  # () share of the steps in which the shield changed the torque
+    mean_torque_change: jax.Array  # () [N m] mean norm of that change over all steps
+    deadlocked: jax.Array  # () bool, not settled and the shield changed the torque in the last step
+
+    @property
+    def reward(self) -> jax.Array:
+        """Sum over the maneuver of the paper's own reward.  Returns ()."""
+        return reward.total(self.reward_terms, reward.PAPER_WEIGHTS)
+
+    @property
+    def success(self) -> jax.Array:
+        """Settled and never in a zone.  Returns () bool."""
+        return self.settled & ~self.violated
+
+
+class History(struct.PyTreeNode):
+    """A maneuver step by step; leaves have a leading axis of steps + 1, the start first."""
+
+    state: EnvState
+    attitude_error: jax.Array  # (steps + 1, 4) q_e
+    torque_B: jax.Array  # (steps + 1, 3) [N m] applied from this instant on; the last row repeats
+    zone_margin: jax.Array  # (steps + 1,) [rad] to the nearest zone
+    pointing_error: jax.Array  # (steps + 1,) [rad] phi
+
+
+class _Flight(struct.PyTreeNode):
+    """A maneuver under way."""
+
+    state: EnvState
+    memory: Memory
+    truth: Truth  # that is met: what is uncertain is drawn for the whole maneuver
+    key: jax.Array  # () typed PRNG key of the measurement noise
+
+
+class _Tally(struct.PyTreeNode):
+    flight: _Flight
+    reward_terms: RewardTerms
+    control_effort: jax.Array
+    min_margin: jax.Array
+    last_unsettled: jax.Array  # () int32, last instant (in steps) at which phi was outside; -1 if none
+    interventions: jax.Array  # () steps in which the shield changed the torque
+    torque_change: jax.Array  # () [N m] sum of the norms of that change
+    intervened: jax.Array  # () bool, in the last step
+
+
+def _take_off(env: Reorientation, controller: Controller, drawn: Scenario, key: jax.Array) -> _Flight:
+    key_controller, key_truth, key_noise = jax.random.split(key, 3)
+    state = env.reset(drawn)
+    memory = controller.begin(state, env.model, key_controller)
+    return _Flight(state, memory, env.sample_truth(key_truth), key_noise)
+
+
+def _step(env: Reorientation, controller: Controller, flight: _Flight) -> tuple[_Flight, Step]:
+    """Fly one step; the controller and the shield know the state as it is measured."""
+    measured = env.measure(flight.state, flight.key)
+    action, memory = controller.decide(measured, env.model, flight.memory)
+    stepped = env.step(flight.state, action, measured=measured, truth=flight.truth)
+    return flight.replace(state=stepped.state, memory=memory), stepped
+
+
+def _margin_between(env: Reorientation, before: _Flight, torque_B: jax.Array, substeps: int) -> jax.Array:
+    """Smallest margin at ``substeps - 1`` instants inside the step that starts here.  Returns () [rad]."""
+    margins = [jnp.float32(jnp.inf)]
+    for i in range(1, substeps):
+        body = propagate(before.state.body, torque_B, before.truth, env.model.dt * (i / substeps))
+        margins.append(env.margin(before.state.replace(body=body)))
+    return jnp.min(jnp.stack(margins))
+
+
+def _last_unsettled(env: Reorientation, state: EnvState, before: jax.Array) -> jax.Array:
+    """Last instant at which phi was outside, given that before this state.  Returns () int32."""
+    return jnp.where(reward.is_settled(state.angle, env.reward), before, state.steps)
+
+
+def _first_tally(env: Reorientation, start: _Flight) -> _Tally:
+    """What is known at the start."""
+    return _Tally(
+        flight=start,
+        reward_terms=jax.tree.map(lambda _: jnp.zeros(()), reward.PAPER_WEIGHTS),
+        control_effort=jnp.zeros(()),
+        min_margin=env.margin(start.state),
+        last_unsettled=_last_unsettled(env, start.state, jnp.int32(-1)),
+        interventions=jnp.int32(0),
+        torque_change=jnp.zeros(()),
+        intervened=jnp.array(False),
+    )
+
+
+def run_case(
+    env: Reorientation, controller: Controller, drawn: Scenario, substeps: int = 1, key: jax.Array | None = None
+) -> CaseResult:
+    """Fly one maneuver and judge it.
+
+    Args:
+        env: what is flown, for its ``episode_steps``.
+        controller: who flies.
+        drawn: the maneuver.
+        substeps: the zone is checked at so many instants per step; 1 checks at the steps only.
+        key: () typed PRNG key of what is random in the controller and in the truth.
+    """
+    start = _take_off(env, controller, drawn, jax.random.key(0) if key is None else key)
+    limits = env.nominal_limits
+
+    def advance(tally: _Tally, _: None) -> tuple[_Tally, None]:
+        flight, stepped = _step(env, controller, tally.flight)
+        margin = stepped.outcome.zone_margin
+        if substeps > 1:
+            margin = jnp.minimum(margin, _margin_between(env, tally.flight, stepped.state.torque_B, substeps))
+        change_B = limits.box_B * stepped.command.change
+        return _Tally(
+            flight=flight,
+            reward_terms=jax.tree.map(jnp.add, tally.reward_terms, stepped.terms),
+            control_effort=tally.control_effort + stepped.outcome.torque**2 * env.model.dt,
+            min_margin=jnp.minimum(tally.min_margin, margin),
+            last_unsettled=_last_unsettled(env, stepped.state, tally.last_unsettled),
+            interventions=tally.interventions + stepped.command.intervened,
+            torque_change=tally.torque_change + jnp.linalg.norm(change_B),
+            intervened=stepped.command.intervened,
+        ), None
+
+    end, _ = jax.lax.scan(advance, _first_tally(env, start), None, length=env.episode_steps)
+    settled = end.last_unsettled < env.episode_steps
+    return CaseResult(
+        initial_angle=start.state.angle,
+        reward_terms=end.reward_terms,
+        settling_time=jnp.where(settled, (end.last_unsettled + 1) * env.model.dt, jnp.nan),
+        control_effort=end.control_effort,
+        control_accuracy=reward.pointing_error(end.flight.state.angle, env.reward),
+        min_margin=end.min_margin,
+        settled=settled,
+        violated=end.min_margin <= 0.0,
+        intervention_rate=end.interventions / env.episode_steps,
+        mean_torque_change=end.torque_change / env.episode_steps,
+        deadlocked=~settled & end.intervened,
+    )
+
+
+def fly(env: Reorientation, controller: Controller, drawn: Scenario, key: jax.Array | None = None) -> History:
+    """Fly one maneuver, the same as ``run_case`` does with the same key, and keep everything."""
+    start = _take_off(env, controller, drawn, jax.random.key(0) if key is None else key)
+
+    def advance(flight: _Flight, _: None) -> tuple[_Flight, EnvState]:
+        return _step(env, controller, flight)[0], flight.state
+
+    end, before = jax.lax.scan(advance, start, None, length=env.episode_steps)
+    states = jax.tree.map(lambda rows, last: jnp.concatenate([rows, last[None]]), before, end.state)
+    # A state holds the torque that led to it, so the torque applied from an instant on is that of the next state.
+    applied_B = jnp.concatenate([states.torque_B[1:], states.torque_B[-1:]])
+    return History(
+        state=states,
+        attitude_error=jax.vmap(attitude_error)(states),
+        torque_B=applied_B,
+        zone_margin=jax.vmap(env.margin)(states),
+        pointing_error=reward.pointing_error(states.angle, env.reward),
+    )

@@ -1,0 +1,76 @@
+"""Results as text: a CSV row per case, a CSV row per instant of a maneuver, one case in words."""
+
+import csv
+import io
+from collections.abc import Iterable
+
+import numpy as np
+
+from koz_jax.config.task import TaskConfig
+from koz_jax.evaluation.rollout import CaseResult, History
+
+
+def _csv(columns: dict[str, np.ndarray]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*(_cells(values) for values in columns.values()), strict=True))
+    return text.getvalue()
+
+
+def _cells(values: np.ndarray) -> Iterable[str]:
+    exact = values.dtype.kind in "biu"
+    return [str(int(value)) if exact else f"{value:.9g}" for value in values]
+
+
+def cases_csv(results: CaseResult) -> str:
+    """A row per case.  results: NumPy leaves (cases,)."""
+    return _csv(
+        {
+            "case": np.arange(len(results.settled)),
+            "initial_angle_deg": np.rad2deg(results.initial_angle),
+            "reward": np.asarray(results.reward),
+            "settling_time_s": np.asarray(results.settling_time),
+            "control_effort_N2m2s": np.asarray(results.control_effort),
+            "control_accuracy_deg": np.rad2deg(results.control_accuracy),
+            "min_margin_deg": np.rad2deg(results.min_margin),
+            "intervention_rate": np.asarray(results.intervention_rate),
+            "mean_torque_change_Nm": np.asarray(results.mean_torque_change),
+            "deadlocked": np.asarray(results.deadlocked),
+            "settled": np.asarray(results.settled),
+            "violated": np.asarray(results.violated),
+        }
+    )
+
+
+def history_csv(history: History, task: TaskConfig) -> str:
+    """A row per instant of a maneuver, the start first."""
+    seconds = np.arange(len(history.zone_margin)) * task.step_seconds
+    columns = {"time_s": seconds}
+    q_e = np.asarray(history.attitude_error)
+    columns |= {f"q_e{i}": q_e[:, i] for i in range(4)}
+    omega_deg = np.rad2deg(history.state.body.omega_BN_B)
+    columns |= {f"omega_{axis}_deg_s": omega_deg[:, i] for i, axis in enumerate("xyz")}
+    columns |= {f"torque_{axis}_Nm": np.asarray(history.torque_B)[:, i] for i, axis in enumerate("xyz")}
+    columns |= {
+        "theta_margin_deg": np.rad2deg(history.zone_margin),
+        "phi_deg": np.rad2deg(history.pointing_error),
+    }
+    return _csv(columns)
+
+
+def describe_case(case: int, result: CaseResult) -> str:
+    """One case in one line."""
+    return f"case {case}: {describe_result(result)}"
+
+
+def describe_result(result: CaseResult) -> str:
+    """What a maneuver comes to, in one line."""
+    settled = f"settled after {float(result.settling_time):.1f} s" if result.settled else "not settled"
+    zone = "violated the zone" if result.violated else "stayed clear of the zone"
+    return (
+        f"{np.rad2deg(float(result.initial_angle)):.1f} deg, {settled}, {zone}"
+        f" (smallest margin {np.rad2deg(float(result.min_margin)):.2f} deg),"
+        f" effort {float(result.control_effort):.1f} N2 m2 s,"
+        f" accuracy {np.rad2deg(float(result.control_accuracy)):.4f} deg, reward {float(result.reward):.1f}"
+    )

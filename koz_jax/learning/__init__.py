@@ -1,0 +1,1 @@
+"""What learns: curriculum, training step, refinement."""

@@ -1,0 +1,189 @@
+"""The training state and its one jitted transition: collect, sample, reward under the curriculum, learn."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from koz_jax.config.training import TrainConfig
+from koz_jax.control import encoding
+from koz_jax.control.shield import under_shield
+from koz_jax.learning import curriculum, finite_checks
+from koz_jax.learning.curriculum import Difficulty
+from koz_jax.sac import learner as sac_learner
+from koz_jax.sac import replay_buffer
+from koz_jax.sac.learner import LearnerMetrics, LearnerState, Sac
+from koz_jax.sac.losses import Batch
+from koz_jax.sac.replay_buffer import ReplayBuffer, Transition
+from koz_jax.task import observation_layout, reward
+from koz_jax.task.environment import Reorientation
+from koz_jax.task.observation_layout import ACTION_SIZE
+from koz_jax.task.reward import RewardTerms
+from koz_jax.task.scenario import SamplingRule
+from koz_jax.task.state import EnvState
+
+# Training draws scenarios all the time, also at angles where no zone fits; it soon takes what it can get.
+MAX_DRAWS = 8
+
+# Episodes start in so many groups, spread over an episode, so that the buffer holds all parts of a maneuver.
+_START_GROUPS = 16
+
+
+class TrainState(struct.PyTreeNode):
+    """Everything that a resume needs."""
+
+    learner: LearnerState
+    buffer: ReplayBuffer
+    env_states: EnvState  # leading axis: environments
+    key: jax.Array  # () typed PRNG key
+    updates: jax.Array  # () int32, gradient updates done
+
+
+class TrainMetrics(struct.PyTreeNode):
+    """Means over a chunk of training."""
+
+    learner: LearnerMetrics
+    reward: RewardTerms  # per environment step, unweighted
+    fault: jax.Array  # () int32, the first term that was not finite (see ``finite_checks``)
+
+
+def make_sac(config: TrainConfig) -> Sac:
+    """The learner's static settings."""
+    return Sac(
+        hidden_sizes=config.network.hidden_sizes,
+        encoding=encoding.views(config.network),
+        observation_size=observation_layout.size(config.network.observed_zones),
+        action_size=ACTION_SIZE,
+        target_entropy=config.sac.target_entropy,
+        soft_update=config.sac.soft_update,
+        policy_average=config.sac.policy_average,
+        initial_entropy_coefficient=config.sac.initial_entropy_coefficient,
+    )
+
+
+def training_environment(config: TrainConfig) -> Reorientation:
+    """Set up what is trained in; the curriculum sets the deviations, see ``at_difficulty``."""
+    rule = SamplingRule(config.task.scenario.infeasible_zone, MAX_DRAWS, keep_angle=True)
+    env = Reorientation.from_config(config.task, rule=rule, observed_zones=config.network.observed_zones)
+    env = env.replace(episode_steps=config.training_episode_steps)
+    return under_shield(env, config.shielding.in_force)
+
+
+def at_difficulty(env: Reorientation, at: Difficulty) -> Reorientation:
+    """Draw scenarios as the curriculum says."""
+    ranges = env.ranges.replace(min_angle=at.min_angle, max_angle=at.max_angle, angle_bias=at.angle_bias)
+    return env.replace(ranges=ranges)
+
+
+def _advance(
+    config: TrainConfig, env: Reorientation, states: EnvState, action: jax.Array, key: jax.Array
+) -> tuple[EnvState, Transition]:
+    """One step of all environments; those at the end of their episode start a new scenario."""
+    stepped = env.step_autoreset(states, action, lambda: jax.random.split(key, config.num_envs))
+    return stepped.state, Transition(
+        observation=jax.vmap(env.observe)(states),
+        action=action,
+        outcome=stepped.outcome,
+        terminated=stepped.terminated,
+        truncated=stepped.truncated,
+        next_observation=stepped.final_observation,
+    )
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def init(config: TrainConfig, key: jax.Array) -> TrainState:
+    """Fresh networks, and a buffer filled with ``prefill_steps`` of random actions."""
+    key_learner, key_envs, key_fill, key = jax.random.split(key, 4)
+    at = curriculum.difficulty(config.curriculum, jnp.zeros((), jnp.int32))
+    env = at_difficulty(training_environment(config), at)
+    states = jax.vmap(env.reset)(jax.random.split(key_envs, config.num_envs))
+    group = jnp.arange(config.num_envs) * _START_GROUPS // config.num_envs
+    head_start = group * config.training_episode_steps // _START_GROUPS
+
+    def random_step(states: EnvState, key_step: jax.Array) -> tuple[EnvState, Transition]:
+        key_action, key_reset = jax.random.split(key_step)
+        action = jax.random.uniform(key_action, (config.num_envs, ACTION_SIZE), minval=-1.0, maxval=1.0)
+        return _advance(config, env, states, action, key_reset)
+
+    example = jax.eval_shape(random_step, states, key_fill)[1]
+    buffer = replay_buffer.init(example, config.buffer_steps)
+
+    def fill(
+        carry: tuple[EnvState, ReplayBuffer], row: tuple[jax.Array, jax.Array]
+    ) -> tuple[tuple[EnvState, ReplayBuffer], None]:
+        states, buffer = carry
+        number, key_step = row
+        states, transition = random_step(states, key_step)
+        # After the first step, which the environment knows by its number.
+        states = states.replace(steps=states.steps + jnp.where(number == 0, head_start, 0))
+        return (states, replay_buffer.insert(buffer, transition)), None
+
+    fill_keys = jax.random.split(key_fill, config.prefill_steps)
+    (states, buffer), _ = jax.lax.scan(fill, (states, buffer), (jnp.arange(config.prefill_steps), fill_keys))
+    return TrainState(
+        learner=sac_learner.init(make_sac(config), key_learner),
+        buffer=buffer,
+        env_states=states,
+        key=key,
+        updates=jnp.zeros((), jnp.int32),
+    )
+
+
+def _rewarded_batch(
+    config: TrainConfig, env: Reorientation, buffer: ReplayBuffer, at: Difficulty, key: jax.Array
+) -> Batch:
+    """Draw transitions and reward them as the curriculum stands now.  Leaves: (updates_per_step * batch, ...)."""
+    count = config.updates_per_step * config.sac.batch_size
+    windows = replay_buffer.sample_windows(buffer, key, count, config.sac.n_step)
+    terms = reward.terms(windows.outcome, curriculum.reward_params(at, env.reward), env.nominal_limits)
+    weights = curriculum.reward_weights(at).replace(intervention=config.shielding.intervention_cost)
+    rewards = config.sac.reward_scale * reward.total(terms, weights)
+    return replay_buffer.n_step_batch(windows, rewards, at.discount)
+
+
+def train_step(config: TrainConfig, env: Reorientation, state: TrainState) -> tuple[TrainState, TrainMetrics]:
+    """One step of all environments, then ``updates_per_step`` gradient updates."""
+    sac = make_sac(config)
+    at = curriculum.difficulty(config.curriculum, state.updates)
+    key, key_action, key_reset, key_batch, key_updates = jax.random.split(state.key, 5)
+
+    env = at_difficulty(env, at)
+    observed = jax.vmap(env.observe)(state.env_states)
+    action, _ = sac.act(state.learner.policy, observed).sample(key_action)
+    env_states, transition = _advance(config, env, state.env_states, action, key_reset)
+    buffer = replay_buffer.insert(state.buffer, transition)
+
+    drawn = _rewarded_batch(config, env, buffer, at, key_batch)
+    batches = jax.tree.map(lambda leaf: leaf.reshape(config.updates_per_step, -1, *leaf.shape[1:]), drawn)
+
+    def learn(learner: LearnerState, inputs: tuple[Batch, jax.Array]) -> tuple[LearnerState, LearnerMetrics]:
+        batch, key_update = inputs
+        return sac_learner.update(sac, learner, batch, key_update, at.learning_rate)
+
+    keys = jax.random.split(key_updates, config.updates_per_step)
+    learner, learner_metrics = jax.lax.scan(learn, state.learner, (batches, keys))
+    terms = reward.terms(transition.outcome, env.reward, env.nominal_limits)
+    networks = (state.learner.policy, state.learner.critic, state.learner.log_alpha)
+    fault = finite_checks.first_fault(finite_checks.Watched(networks, observed, terms, drawn.reward, learner_metrics))
+    state = TrainState(learner, buffer, env_states, key, state.updates + config.updates_per_step)
+    learned, rewarded = jax.tree.map(jnp.mean, (learner_metrics, terms))
+    return state, TrainMetrics(learned, rewarded, fault)
+
+
+@functools.partial(jax.jit, static_argnames="config", donate_argnames="state")
+def train_chunk(config: TrainConfig, state: TrainState, steps: jax.Array) -> tuple[TrainState, TrainMetrics]:
+    """Run ``steps`` training steps (traced: chunks of any length share one compilation) and average their metrics."""
+    env = training_environment(config)
+
+    def body(_: jax.Array, carry: tuple[TrainState, TrainMetrics]) -> tuple[TrainState, TrainMetrics]:
+        state, sums = carry
+        state, metrics = train_step(config, env, state)
+        first = jnp.where(sums.fault == finite_checks.NO_FAULT, metrics.fault, sums.fault)
+        return state, jax.tree.map(jnp.add, sums, metrics).replace(fault=first)
+
+    shapes = jax.eval_shape(lambda s: train_step(config, env, s)[1], state)
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    zeros = zeros.replace(fault=jnp.int32(finite_checks.NO_FAULT))
+    state, sums = jax.lax.fori_loop(0, steps, body, (state, zeros))
+    return state, jax.tree.map(lambda total: total / steps, sums).replace(fault=sums.fault)

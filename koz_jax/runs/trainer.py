@@ -1,0 +1,249 @@
+"""The host loop of training: chunks, evaluation, best agents, checkpoints, logs, interrupts."""
+
+import contextlib
+import math
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from koz_jax.agents.agent import Agent
+from koz_jax.config.monte_carlo import MonteCarloConfig
+from koz_jax.config.task import check_feasible
+from koz_jax.config.training import TrainConfig
+from koz_jax.control.policy import PolicyController
+from koz_jax.errors import SettingsError
+from koz_jax.evaluation import cases
+from koz_jax.evaluation.summary import Summary, summarise
+from koz_jax.learning.finite_checks import NO_FAULT
+from koz_jax.runs import checkpoint, divergence, memory, provenance, sharding, stages
+from koz_jax.runs.checkpoint import Checkpoint, RunState
+from koz_jax.runs.folder import RunFolder
+from koz_jax.runs.interrupt import GracefulShutdown
+from koz_jax.runs.progress import Progress
+from koz_jax.runs.stages import Stage
+from koz_jax.runs.writer import RunWriter
+from koz_jax.sac.learner import LearnerState
+from koz_jax.storage import processes
+from koz_jax.storage.lock import FolderLock
+
+# Evaluation scenarios during training: the same for every run, and drawn from a seed that people do not type.
+_EVAL_SEED = 2_718_281_828
+
+_EVAL_NAMES = ("eval/score", *(f"eval/{name}" for name in Summary.__dataclass_fields__))
+
+
+def train(
+    config: TrainConfig,
+    run: Path | str,
+    *,
+    resume: bool = False,
+    start_from: Path | str | None = None,
+    progress: bool = True,
+    devices: int = 1,
+    command: str = "",
+) -> Agent | None:
+    """Train an agent.
+
+    Args:
+        config: the run's settings (with ``resume``: those that the run began with).
+        run: folder of the run; new or empty unless ``resume``.
+        resume: go on exactly where the run stopped.
+        start_from: a snapshot (or the checkpoint of another run) whose learner and replay buffer to begin with.
+        progress: show a progress bar on stderr.
+        devices: divide the environments and the replay buffer among so many devices of this process.  Several
+            processes (see ``runtime.join``) divide them among the devices of all; all get the same arguments and need
+            a folder that all of them see, and the first one writes.
+        command: the command line, where there is one; the records of the agents note it.
+
+    Returns:
+        The best agent of the last phase, or None if the run was interrupted (its checkpoint is then up to date).
+
+    Raises:
+        SettingsError: the settings ask for the impossible, or a folder is not what it should be; nothing was written.
+        StorageError: a file cannot be written, or all checkpoints are damaged.
+        DivergenceError: training came to numbers that are not finite.
+
+    """
+    if resume and start_from is not None:
+        raise SettingsError(f"start_from: a resumed run goes on from its own checkpoint, got {start_from}")
+    folder = RunFolder(Path(run))
+    # All of several processes come here, so that they can say it together.
+    processes.all_or_none(lambda: sharding.check(config, devices))
+    alike = (config, resume, start_from and str(start_from), devices, provenance.version())
+    processes.assert_equal_across_processes("settings", alike)
+    opening = _resumed(folder, config) if resume else _begun(folder, config, start_from)
+    with GracefulShutdown() as shutdown, opening as saved:
+        processes.assert_equal_across_processes("checkpoint", (saved.state.done, saved.log))
+        shown = progress and processes.is_primary_process()
+        with Progress(stages.plan(config), saved.state.done, enabled=shown) as bar:
+            bar.note(f"run folder: {folder.path}")
+            with memory.exhaustion_in_one_line():
+                return _Run(config, folder, bar, shutdown, devices, command).go(saved)
+
+
+@contextlib.contextmanager
+def _resumed(folder: RunFolder, config: TrainConfig) -> Iterator[Checkpoint]:
+    """A run to go on with, locked."""
+    with contextlib.ExitStack() as stack:
+
+        def read() -> Checkpoint:
+            if not folder.config.is_file():
+                raise SettingsError(f"resume: {folder.path} is not a run folder (it has no {folder.config.name})")
+            if processes.is_primary_process():
+                stack.enter_context(FolderLock(folder.path))
+            _check_memory(config)
+            return checkpoint.load(folder, config)
+
+        yield processes.all_or_none(read)
+
+
+@contextlib.contextmanager
+def _begun(folder: RunFolder, config: TrainConfig, start_from: Path | str | None) -> Iterator[Checkpoint]:
+    """A new run, locked, with its first checkpoint; on an error before that nothing is left of it."""
+    with contextlib.ExitStack() as stack:
+
+        def prepare() -> RunState:
+            if processes.is_primary_process():
+                stack.enter_context(folder.begin())
+            source = checked_source(config, start_from)
+            with memory.exhaustion_in_one_line():
+                return checkpoint.begin(config, source)
+
+        def write() -> None:
+            if processes.is_primary_process():
+                checkpoint.save(folder.checkpoint(0), state, config)
+                folder.write_config(config)
+
+        state = processes.all_or_none(prepare)
+        processes.all_or_none(write)
+        yield Checkpoint(state, "")
+
+
+def checked_source(config: TrainConfig, start_from: Path | str | None) -> RunState | None:
+    """Refuse a run that cannot be.  Returns what it begins with, where that is another run's.
+
+    Raises:
+        SettingsError: there is no room for a zone, too little memory, or nothing to begin with where it should be.
+        StorageError: what it should begin with is damaged.
+
+    """
+    check_feasible(config.task, config.eval_max_angle_deg, "eval_max_angle_deg")
+    _check_memory(config)
+    return None if start_from is None else checkpoint.load_source(Path(start_from), config)
+
+
+def _check_memory(config: TrainConfig) -> None:
+    shapes = checkpoint.template(config)
+    memory.check(config, shapes.train.buffer, shapes)
+
+
+class _Run:
+    """One run under way; everything that survives it is in ``RunState`` and on disk."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        folder: RunFolder,
+        bar: Progress,
+        shutdown: GracefulShutdown,
+        devices: int,
+        command: str,
+    ) -> None:
+        self.config = config
+        self.folder = folder
+        self.bar = bar
+        self.shutdown = shutdown
+        self.devices = devices
+        self.stages = stages.plan(config)
+        self.provenance = provenance.collect(config, command)
+        self.warned = False  # that the critic diverges
+
+    def go(self, saved: Checkpoint) -> Agent | None:
+        """Train to the end, or until asked to stop."""
+        state = saved.state
+        if stages.after(self.stages, state.done) is not None:
+            with RunWriter(self.folder, self.config, saved) as out:
+                state = self._train(state, out)
+        if stages.after(self.stages, state.done) is not None:
+            return None
+        return self._best_agent(state, self.stages[-1])
+
+    def _train(self, state: RunState, out: RunWriter) -> RunState:
+        """Go on chunk by chunk; log, evaluate and checkpoint on the way."""
+        self.bar.compiling()
+        # The first row of a log names its columns.
+        blank = dict.fromkeys(("refine/cost", *_EVAL_NAMES), math.nan)
+        done = saved_at = state.done
+        while (stage := stages.after(self.stages, done)) and not processes.any_process(self.shutdown.requested):
+            start = time.perf_counter()
+            chunk = stage.advance(state, self.devices)
+            state, before, done = chunk.state, done, chunk.state.done
+            speed = {"updates_per_second": (done - before) / (time.perf_counter() - start)}
+            values = chunk.values | blank | chunk.values  # what is measured stands first, and is not blanked
+            blank = {}
+            self._warn_once(done, chunk.warning)
+            self.bar.advance(done)
+            if stage.is_evaluated_at(done):
+                state, evaluated = self._evaluate(state, stage, out)
+                out.row(done, values | evaluated, speed)
+                out.checkpoint(sharding.gather(state))
+                saved_at = done
+            else:
+                out.row(done, values, speed)
+            processes.raise_in_all(out.error)
+        if saved_at < done:
+            out.checkpoint(sharding.gather(state))
+        return state
+
+    def _warn_once(self, done: int, warning: str | None) -> None:
+        if warning is not None and not self.warned:
+            self.bar.warn(f"update {done}: {warning}")
+            self.warned = True
+
+    def _evaluate(self, state: RunState, stage: Stage, out: RunWriter) -> tuple[RunState, dict[str, float]]:
+        """Evaluate the policy, keep the best, and at the end of a stage hand it on."""
+        done, learner = state.done, stage.learner(state, self.devices)
+        evaluated = self._fly(learner, stage) if processes.is_primary_process() else {"eval/score": math.nan}
+        score = float(processes.broadcast_from_primary(np.float32(evaluated["eval/score"])))
+        divergence.check_finite(done, NO_FAULT, {"eval/score": jnp.float32(score)})
+        if score > float(state.best_score):
+            best = jax.tree.map(jnp.copy, learner)
+            state = state.replace(best=best, best_score=jnp.float32(score), best_at=jnp.int32(done))
+            out.agent(stage.agent, self._best_agent(state, stage))
+        return (self._hand_on(state, stage, out) if done == stage.end else state), evaluated
+
+    def _hand_on(self, state: RunState, stage: Stage, out: RunWriter) -> RunState:
+        """End a stage: keep what others may start from, and begin the next one."""
+        if stage.snapshot is not None:
+            out.snapshot(stage.snapshot, sharding.gather(state))
+        if stage.agent_at_end is not None:
+            out.agent(stage.agent_at_end, self._best_agent(state, stage))
+        following = stages.after(self.stages, stage.end)
+        return state if following is None else following.begin_from(state)
+
+    def _fly(self, learner: LearnerState, stage: Stage) -> dict[str, float]:
+        """Fly the policy; score and summary by the names of their columns."""
+        drawn = MonteCarloConfig(
+            cases=self.config.eval_cases,
+            seed=_EVAL_SEED,
+            min_angle_deg=self.config.eval_min_angle_deg,
+            max_angle_deg=self.config.eval_max_angle_deg,
+            shield=self.config.shielding.in_force,
+        )
+        controller = PolicyController(learner.averaged_policy, self.config.network)
+        results = cases.fly_cases(controller, self.config.task, drawn)
+        summary = summarise(results)
+        self.bar.evaluated(summary)
+        values = {f"eval/{name}": value for name, value in vars(summary).items()}
+        return {"eval/score": stage.score(results), **values}
+
+    def _best_agent(self, state: RunState, stage: Stage) -> Agent:
+        """The best agent so far."""
+        updates, refinements = stages.split(self.stages, int(state.best_at))
+        taken = {"phase": stage.phase, "updates": updates, "refinements": refinements}
+        controller = PolicyController(state.best.averaged_policy, self.config.network)
+        return Agent(controller, self.config.task, self.provenance.model_copy(update=taken), str(self.folder.path))

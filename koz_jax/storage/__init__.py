@@ -1,0 +1,1 @@
+"""Files, archives, locks and processes: the host's side of what lasts."""

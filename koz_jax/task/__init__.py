@@ -1,0 +1,1 @@
+"""The task: pure functions of one sample, and the one environment."""

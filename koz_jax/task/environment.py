@@ -1,0 +1,268 @@
+"""The one environment: training, refinement, Monte Carlo and all adapters fly maneuvers through it.
+
+    env = Reorientation.from_config(TaskConfig())
+    state = env.reset(key)
+    step = env.step(state, action)  # step.state, step.observation, step.terms, step.truncated, ...
+
+Everything is a pure function of one sample; batch it with ``vmap``.  Only ``autoreset`` and ``step_autoreset`` are of
+many environments, which share one draw of new scenarios.
+"""
+
+from collections.abc import Callable
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from koz_jax.config.task import TaskConfig, check_deviations, check_feasible
+from koz_jax.task import observation, pointing_constraints, reward, rotations, scenario, state
+from koz_jax.task import uncertainty as errors
+from koz_jax.task.actuators import TorqueBox, TorqueLimits
+from koz_jax.task.reward import Outcome, RewardParams, RewardTerms
+from koz_jax.task.scenario import SamplingRule, Scenario, ScenarioRanges
+from koz_jax.task.state import EnvState, Model, Truth, attitude_error, select_envs
+from koz_jax.task.uncertainty import Uncertainty
+
+
+class ActionFilter(Protocol):
+    """What stands between a controller and the actuators, such as the shield.  Implementations are pytrees."""
+
+    def start(self, drawn: Scenario, model: Model) -> Scenario:
+        """Make of a scenario one that can be flown under the filter."""
+        ...
+
+    def allow(self, measured: EnvState, action: jax.Array, model: Model) -> jax.Array:
+        """Action (3,) in [-1, 1] that is let through in place of the requested one (3,) in [-1, 1]."""
+        ...
+
+
+class Command(struct.PyTreeNode):
+    """What is asked of the actuators in a step, as shares of the torque limits."""
+
+    requested: jax.Array  # (3,) by the controller, clipped to [-1, 1]
+    applied: jax.Array  # (3,) after the filter
+
+    @property
+    def intervened(self) -> jax.Array:
+        """Whether the filter changed anything.  Returns () bool."""
+        return jnp.any(self.applied != self.requested)
+
+    @property
+    def change(self) -> jax.Array:
+        """What the filter changed.  Returns (3,)."""
+        return jax.lax.stop_gradient(self.applied - self.requested)
+
+
+class Step(struct.PyTreeNode):
+    """What one step gives.  The observation has 16 entries, 5 more for each zone above one that is observed."""
+
+    state: EnvState
+    observation: jax.Array  # (entries,) to act on next; of the next maneuver where ``step_autoreset`` has begun it
+    final_observation: jax.Array  # (entries,) that the step itself led to
+    command: Command
+    outcome: Outcome
+    terms: RewardTerms  # of the paper's reward, unweighted
+    terminated: jax.Array  # () bool, always false: neither settling nor a violation ends a maneuver
+    truncated: jax.Array  # () bool, the maneuver's time is up
+
+
+class Reorientation(struct.PyTreeNode):
+    """Maneuvers of one task; its numbers are traced, so that other ones do not mean another compilation."""
+
+    model: Model
+    reward: RewardParams
+    ranges: ScenarioRanges
+    action_filter: ActionFilter | None = None  # None lets every action through
+    uncertainty: Uncertainty | None = None  # None flies the model itself, measured exactly
+    rule: SamplingRule = struct.field(pytree_node=False, default=SamplingRule())
+    observed_zones: int = struct.field(pytree_node=False, default=1)
+    episode_steps: int = struct.field(pytree_node=False, default=1000)
+
+    @classmethod
+    def from_config(
+        cls,
+        task: TaskConfig | None = None,
+        min_angle_deg: float = 80.0,
+        max_angle_deg: float = 180.0,
+        *,
+        rule: SamplingRule | None = None,
+        observed_zones: int | None = None,
+        action_filter: ActionFilter | None = None,
+        uncertainty: Uncertainty | None = None,
+    ) -> "Reorientation":
+        """Make the environment of a task.
+
+        Args:
+            task: by default the paper's.
+            min_angle_deg: initial deviations are uniform from this angle [deg]
+            max_angle_deg: to this one [deg].
+            rule: how scenarios are drawn; by default until one is feasible.
+            observed_zones: zones in the observation; by default all that a scenario can have.
+            action_filter: what stands between controller and actuators, such as the shield.
+            uncertainty: how far the truth may be from the model.
+
+        Raises:
+            SettingsError: the angles are not in [0, 180], not in order, or leave no room for a zone.
+
+        """
+        task = task or TaskConfig()
+        check_deviations(min_angle_deg, max_angle_deg)
+        if rule is None:
+            check_feasible(task, max_angle_deg)
+        return cls(
+            model=model_from_config(task),
+            reward=reward.from_config(task.reward, task.angle_convention),
+            ranges=scenario.from_config(task.scenario, task.spacecraft.boresight, min_angle_deg, max_angle_deg),
+            action_filter=action_filter,
+            uncertainty=uncertainty,
+            rule=rule or SamplingRule(task.scenario.infeasible_zone),
+            observed_zones=observed_zones or task.scenario.max_zones,
+            episode_steps=task.episode_steps,
+        )
+
+    @property
+    def nominal_limits(self) -> TorqueLimits:
+        """Torques that can be asked for at the start of a maneuver; rewards count torques in shares of them."""
+        return self.model.actuators.limits(self.model.actuators.initial_state())
+
+    def sample(self, key: jax.Array) -> Scenario:
+        """Draw a scenario, as it is drawn; ``reset`` may make it one that can be flown.  key: () typed PRNG key."""
+        return scenario.sample(key, self.ranges, self.rule)
+
+    def reset(self, start: jax.Array | Scenario) -> EnvState:
+        """Begin a maneuver: a given scenario, or one drawn with a typed PRNG key ()."""
+        drawn = start if isinstance(start, Scenario) else self.sample(start)
+        if self.action_filter is not None:
+            drawn = self.action_filter.start(drawn, self.model)
+        return state.begin(drawn, self.model)
+
+    def observe(self, measured: EnvState) -> jax.Array:
+        """What a controller sees of a state.  Returns (16,), 5 more for each observed zone above one."""
+        return observation.observe(measured, self.observed_zones)
+
+    def sample_truth(self, key: jax.Array) -> Truth:
+        """Draw the spacecraft that really flies, for a whole maneuver.  key: () typed PRNG key."""
+        if self.uncertainty is None:
+            return state.nominal(self.model)
+        return errors.sample_truth(self.uncertainty, self.model, key)
+
+    def measure(self, at: EnvState, key: jax.Array) -> EnvState:
+        """What sensors make of a state.  key: () typed PRNG key of the maneuver's noise."""
+        if self.uncertainty is None:
+            return at
+        return errors.add_sensor_noise(self.uncertainty, at, jax.random.fold_in(key, at.steps))
+
+    def filter(self, measured: EnvState, action: jax.Array) -> Command:
+        """Clip an action (3,) to [-1, 1], and pass it through the filter.
+
+        The gradient passes the filter as if it were not there: it branches, and has none of its own.
+        """
+        requested = jnp.clip(action, -1.0, 1.0)
+        if self.action_filter is None:
+            return Command(requested, requested)
+        held, asked = jax.lax.stop_gradient((measured, requested))
+        return Command(requested, _straight_through(requested, self.action_filter.allow(held, asked, self.model)))
+
+    def step(
+        self, before: EnvState, action: jax.Array, *, measured: EnvState | None = None, truth: Truth | None = None
+    ) -> Step:
+        """Fly one time step.
+
+        Args:
+            before: where the maneuver is.
+            action: (3,) in [-1, 1] (clipped), share of the torque limits.
+            measured: what the filter knows of the state; by default the state itself.
+            truth: what flies; by default the model.
+        """
+        command = self.filter(before if measured is None else measured, action)
+        after, outcome = self._advance(before, command, state.nominal(self.model) if truth is None else truth)
+        observed = self.observe(after)
+        return Step(
+            state=after,
+            observation=observed,
+            final_observation=observed,
+            command=command,
+            outcome=outcome,
+            terms=reward.terms(outcome, self.reward, self.nominal_limits),
+            terminated=jnp.array(False),
+            truncated=after.steps >= self.episode_steps,
+        )
+
+    def _advance(self, before: EnvState, command: Command, truth: Truth) -> tuple[EnvState, Outcome]:
+        torque_B, actuators = self.model.actuators.apply(command.applied, before.actuators)
+        after = before.replace(
+            body=state.propagate(before.body, torque_B, truth, self.model.dt),
+            q_e0_previous=attitude_error(before)[0],
+            torque_B=torque_B,
+            steps=before.steps + 1,
+            actuators=actuators,
+        )
+        after = after.replace(angle=rotations.rotation_angle(attitude_error(after)))
+        change = jnp.where(before.steps == 0, 0.0, rotations.norm(torque_B - before.torque_B))
+        return after, Outcome(
+            angle=after.angle,
+            angle_previous=before.angle,
+            torque=rotations.norm(torque_B),
+            torque_change=change,
+            zone_margin=self.margin(after),
+            intervention=rotations.norm(command.change),
+        )
+
+    def margin(self, at: EnvState) -> jax.Array:
+        """Margin of the constraint that is nearest to being violated.  Returns () [rad]."""
+        return pointing_constraints.smallest_margin(at.body.q_BN, at.scenario.constraints)
+
+    def autoreset(
+        self, over: jax.Array, states: EnvState, observed: jax.Array, keys: Callable[[], jax.Array]
+    ) -> tuple[EnvState, jax.Array]:
+        """Begin the next maneuver of every environment whose last one is over.
+
+        Args:
+            over: (n,) bool.
+            states: leaves (n, ...).
+            observed: (n, entries) observations of the states.
+            keys: makes the typed keys (n,) of the next maneuvers.
+
+        Returns:
+            States, and their observations.
+
+        """
+
+        def restart() -> tuple[EnvState, jax.Array]:
+            fresh = jax.vmap(self.reset)(keys())
+            return select_envs(over, (fresh, jax.vmap(self.observe)(fresh)), (states, observed))
+
+        # Drawing scenarios costs more than a step, and most steps end no maneuver.
+        return jax.lax.cond(jnp.any(over), restart, lambda: (states, observed))
+
+    def step_autoreset(self, states: EnvState, actions: jax.Array, keys: Callable[[], jax.Array]) -> Step:
+        """Step many environments; where that ends a maneuver, the next one begins within the same step.
+
+        states: leaves (n, ...); actions: (n, 3); keys: as of ``autoreset``.  Returns leaves (n, ...).
+        """
+        stepped = jax.vmap(self.step)(states, actions)
+        next_states, observed = self.autoreset(stepped.truncated, stepped.state, stepped.final_observation, keys)
+        return stepped.replace(state=next_states, observation=observed)
+
+
+@jax.custom_jvp
+def _straight_through(requested: jax.Array, applied: jax.Array) -> jax.Array:
+    """Return what is applied, with the gradient of what was requested."""
+    return applied
+
+
+@_straight_through.defjvp
+def _straight_through_jvp(
+    values: tuple[jax.Array, jax.Array], slopes: tuple[jax.Array, jax.Array]
+) -> tuple[jax.Array, jax.Array]:
+    return values[1], slopes[0]
+
+
+def model_from_config(task: TaskConfig) -> Model:
+    """The spacecraft as the settings say, float32."""
+    return Model(
+        inertia_B=jnp.array(task.spacecraft.inertia),
+        actuators=TorqueBox(jnp.array(task.spacecraft.torque_limits, jnp.float32)),
+        dt=jnp.float32(task.step_seconds),
+    )

@@ -1,0 +1,75 @@
+"""Pointing constraints: cones of inertial directions that an instrument must not look into (Eq. 4 of the paper).
+
+The socket for spacecraft engineers: a constraint is data, a pair of an instrument and a cone, and several of them are
+a stack along a leading axis.  Everything else (observation, reward, shield, planners, figures) reads the stack, and
+knows no other boresight.  Geometry is of one constraint; stacks are mapped over by ``margins``.
+"""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from koz_jax.task import rotations
+from koz_jax.task.observation_layout import ABSENT_HALF_ANGLE
+
+
+class PointingConstraint(struct.PyTreeNode):
+    """One instrument and one cone that it must not look into, or a stack of such pairs along a leading axis."""
+
+    boresight_B: jax.Array  # (3,) unit vector of the instrument, in body axes
+    axis_N: jax.Array  # (3,) unit vector to the bright object, in inertial axes (n_F of the paper)
+    half_angle: jax.Array  # () [rad] (theta_F of the paper); ``ABSENT_HALF_ANGLE`` stands for no cone
+
+    @property
+    def is_present(self) -> jax.Array:
+        """Whether there is a cone at all.  Returns () bool."""
+        return self.half_angle > 0.0
+
+    @property
+    def count(self) -> int:
+        """Number of constraints in a stack."""
+        return self.half_angle.shape[0]
+
+
+def keep_out(boresight_B: jax.Array, axis_N: jax.Array, half_angle: jax.Array) -> PointingConstraint:
+    """Make one constraint of floats.  boresight_B, axis_N: (3,) unit vectors; half_angle: () [rad]."""
+    return PointingConstraint(boresight_B, axis_N, half_angle)
+
+
+def absent(count: int, boresight_B: jax.Array) -> PointingConstraint:
+    """Stand-ins for no constraint of an instrument, with a margin of at least pi everywhere.  Returns a stack."""
+    return PointingConstraint(
+        boresight_B=jnp.tile(boresight_B, (count, 1)),
+        axis_N=jnp.tile(jnp.array([1.0, 0.0, 0.0]), (count, 1)),
+        half_angle=jnp.full(count, ABSENT_HALF_ANGLE),
+    )
+
+
+def boresight_N(q_BN: jax.Array, constraint: PointingConstraint) -> jax.Array:
+    """Where the instrument looks.  q_BN: (4,).  Returns (3,) unit vector in inertial axes."""
+    return rotations.rotate(q_BN, constraint.boresight_B)
+
+
+def axis_B(q_BN: jax.Array, constraint: PointingConstraint) -> jax.Array:
+    """Where the cone is, seen from the body.  q_BN: (4,).  Returns (3,) unit vector in body axes."""
+    return rotations.rotate(rotations.conjugate(q_BN), constraint.axis_N)
+
+
+def angle_to_axis(q_BN: jax.Array, constraint: PointingConstraint) -> jax.Array:
+    """theta, the angle between the boresight and the cone's axis.  q_BN: (4,).  Returns () [rad]."""
+    return rotations.angle_between(boresight_N(q_BN, constraint), constraint.axis_N)
+
+
+def margin(q_BN: jax.Array, constraint: PointingConstraint) -> jax.Array:
+    """theta_margin = theta - theta_F; the constraint is violated when it is <= 0.  q_BN: (4,).  Returns () [rad]."""
+    return angle_to_axis(q_BN, constraint) - constraint.half_angle
+
+
+def margins(q_BN: jax.Array, constraints: PointingConstraint) -> jax.Array:
+    """Margin of each of several constraints.  q_BN: (4,).  Returns (constraints,) [rad]."""
+    return jax.vmap(margin, in_axes=(None, 0))(q_BN, constraints)
+
+
+def smallest_margin(q_BN: jax.Array, constraints: PointingConstraint) -> jax.Array:
+    """Margin of the constraint that is nearest to being violated.  q_BN: (4,).  Returns () [rad]."""
+    return jnp.min(margins(q_BN, constraints))

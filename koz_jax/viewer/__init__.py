@@ -1,0 +1,1 @@
+"""The interactive 3-D page of maneuvers; opens offline."""

@@ -1,0 +1,217 @@
+"""``koz evaluate`` as a user meets it: its table, its files, its errors."""
+
+import csv
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support import tiny
+
+from koz_jax.cli.evaluate import EvaluateFlags
+from koz_jax.evaluation import cases
+
+pytestmark = pytest.mark.usefixtures("empty_cwd")
+
+JSON_KEYS = [
+    *("cases", "seed", "agent", "mean_reward", "std_reward", "settling_time_mean", "settling_time_std"),
+    *("control_effort_mean", "control_effort_std", "control_accuracy_deg_mean", "control_accuracy_deg_std"),
+    *("non_settled_rate", "violation_rate", "success_rate"),
+    *("min_margin_deg", "intervention_rate", "mean_torque_change", "deadlock_rate", "compile_s", "wall_s"),
+]
+
+
+@pytest.fixture
+def no_flight(monkeypatch) -> None:
+    """Make an error of any flight."""
+    for name in ("_fly_cases", "_keep_and_evaluate"):
+        monkeypatch.setattr(cases, name, lambda *_, **__: pytest.fail("something was flown"))
+
+
+def refused(capsys: Any, *argv: object) -> str:
+    """What a command line that is refused says."""
+    assert tiny.status("evaluate", *argv) == 2
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert "Traceback" not in output.err
+    assert 0 < len(output.err.splitlines()) <= 14
+    return output.err
+
+
+# Arguments, and what the message must say: the field, the value, what is allowed.
+BAD = [
+    ("--cases 0", ["cases: Input should be greater than 0 (got 0)"]),
+    ("--cases -5", ["cases: Input should be greater than 0 (got -5)"]),
+    ("--cases 1.5", ["cases: Input should be a valid integer", "1.5"]),
+    ("--cases 1e-3", ["cases: Input should be a valid integer", "0.001"]),
+    ("--cases many", ["cases: Input should be a valid integer", "many"]),
+    ("--cases 1e10", ["cases: Input should be less than 2147483648 (got 10000000000"]),
+    ("--seed -1", ["seed: Input should be greater than or equal to 0 (got -1)"]),
+    ("--min-angle-deg nan", ["min_angle_deg: Input should be a finite number (got nan)"]),
+    ("--max-angle-deg inf", ["max_angle_deg: Input should be a finite number (got inf)"]),
+    ("--min-angle-deg 170 --max-angle-deg 100", ["max_angle_deg must be in [min_angle_deg = 170.0, 180]; got 100.0"]),
+    ("--min-angle-deg 10 --max-angle-deg 30", ["max_angle_deg: must be above 34 deg", "got 30", "shrink"]),
+    ("--substeps 0", ["substeps: Input should be greater than 0 (got 0)"]),
+    ("--angle-convention quarter", ["--angle-convention", "quarter", "full", "half"]),
+    ("--infeasible-zone skip", ["--infeasible-zone", "skip", "resample", "shrink"]),
+    ("--replay-case 10000", ["replay_case: must be from 0 to cases - 1 = 9999, got 10000"]),
+    ("--replay-case 5 --cases 5", ["replay_case: must be from 0 to cases - 1 = 4, got 5"]),
+    ("--replay-case -1", ["replay_case: must be from 0 to cases - 1 = 9999, got -1"]),
+    ("--replay-case abc", ["replay_case: Input should be a valid integer", "abc"]),
+    ("--replay-case 1 --json x.json", ["json: is not written with --replay-case", "x.json"]),
+    ("--replay-case 1 --csv x.csv", ["csv: is not written with --replay-case", "x.csv"]),
+    ("--replay-case 1 --history nowhere/x.csv", ["history: the folder nowhere of nowhere/x.csv does not exist"]),
+    ("--history x.csv", ["history: is written by --replay-case only, got x.csv"]),
+    ("--json nowhere/x.json", ["json: the folder nowhere of nowhere/x.json does not exist"]),
+    ("--csv nowhere/x.csv", ["csv: the folder nowhere of nowhere/x.csv does not exist"]),
+    ("--json .", ["json: . must be a new or an ordinary file"]),
+    ("--csv /dev/null", ["csv: /dev/null must be a new or an ordinary file"]),
+    ("--colour red", ["--colour"]),
+    ("--robust", ["robust: is of the shield, and needs --shield"]),
+    ("--shield-margin-deg 1", ["shield_margin_deg: needs --shield, got 1.0"]),
+    ("--shield --robust", ["robust: needs an error to withstand"]),
+    ("--shield --shield-margin-deg 0", ["shield_margin_deg: Input should be greater than 0"]),
+    ("--shield --robust --disturbance-torque 3", ["disturbance_torque: must be below the torque limit of 2.0", "3.0"]),
+    ("--inertia-error 1.5", ["inertia_error", "less than 1", "1.5"]),
+    ("--controller nobody", ["controller: must be one of pd, potential", "FILE.py:CLASS", "nobody"]),
+    ("--zones 9", ["zones", "less than or equal to 8", "9"]),
+    ("--max-rate-deg -1", ["max_rate_deg", "greater than or equal to 0", "-1"]),
+]
+
+
+@pytest.mark.parametrize(("argv", "words"), BAD, ids=[argv for argv, _ in BAD])
+@pytest.mark.usefixtures("no_flight")
+def test_bad_input_is_refused_by_name_before_anything_happens(capsys, agent, empty_cwd, argv, words):
+    message = refused(capsys, "--agent", agent, *argv.split())
+    for word in words:
+        assert word in message
+    assert list(empty_cwd.iterdir()) == []
+
+
+@pytest.mark.parametrize(("word", "count"), [("1e4", 10_000), ("10_000", 10_000), ("12", 12), ("1.2e1", 12)])
+def test_whole_numbers_may_be_written_in_any_way(word, count):
+    from koz_jax.cli.flags import parsing
+
+    assert parsing.parse(EvaluateFlags, ["--cases", word], "koz evaluate").cases == count
+
+
+@pytest.mark.usefixtures("no_flight")
+def test_a_value_that_is_no_whole_number_is_refused_in_one_line(capsys):
+    assert len(refused(capsys, "--cases", "1.5").splitlines()) == 1
+
+
+@pytest.mark.usefixtures("no_flight")
+def test_an_unwritable_place_is_refused(capsys, agent):
+    if not Path("/proc/self").exists():
+        pytest.skip("needs a folder in which not even root can write")
+    for name in ("json", "csv"):
+        message = refused(capsys, "--agent", agent, f"--{name}", f"/proc/x.{name}")
+        assert f"{name}: /proc/x.{name} cannot be written: " in message
+
+
+@pytest.mark.parametrize("name", ["nobody", "", ".", "nowhere/run"])
+@pytest.mark.usefixtures("no_flight")
+def test_an_unknown_agent_is_refused_and_the_known_are_listed(capsys, monkeypatch, name):
+    monkeypatch.setattr("koz_jax.agents.record.shipped_agents", lambda: ("alpha", "beta"))
+    message = refused(capsys, "--agent", name)
+    assert message.startswith(f"error: agent: {name!r} is neither a shipped agent (alpha, beta) nor a folder with")
+
+
+@pytest.mark.usefixtures("no_flight")
+def test_a_damaged_agent_is_refused(capsys, agent):
+    (agent / "arrays.npz").write_bytes(b"")
+    assert f"{agent}/arrays.npz: damaged" in refused(capsys, "--agent", agent)
+    (agent / "record.json").write_text("{")
+    assert f"{agent}/record.json: cannot be read as JSON" in refused(capsys, "--agent", agent)
+
+
+def test_help_describes_every_flag(capsys):
+    assert tiny.status("evaluate", "--help") == 0
+    # Wrapped lines and their frame do not count.
+    text = re.sub(r"[\s│|]", "", capsys.readouterr().out)
+    assert len(EvaluateFlags.model_fields) >= 25
+    for name, field in EvaluateFlags.model_fields.items():
+        assert f"--{(field.alias or name).replace('_', '-')}" in text
+        assert field.description
+        assert re.sub(r"[\s|]", "", field.description) in text, name
+
+
+def test_table_json_and_csv_tell_the_same(capsys, run, empty_cwd):
+    argv = ["--agent", run.path, "--cases", tiny.CASES, "--seed", 5, "--json", "x.json", "--csv", "x.csv"]
+    assert tiny.status("evaluate", *argv) == 0
+    output = capsys.readouterr().out
+    text = (empty_cwd / "x.json").read_text()
+    report = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    assert list(report) == JSON_KEYS
+    assert (report["cases"], report["seed"], report["agent"]) == (tiny.CASES, 5, str(run.path))
+    # Two seconds are too short to settle: what is over settled cases only is null.
+    assert report["non_settled_rate"] == 1.0 and report["success_rate"] == 0.0
+    assert [name for name in JSON_KEYS if report[name] is None] == [
+        name for name in JSON_KEYS if "control" in name or "settling" in name
+    ][:6]
+
+    rows = list(csv.DictReader((empty_cwd / "x.csv").read_text().splitlines()))
+    assert [int(row["case"]) for row in rows] == list(range(tiny.CASES))
+    rewards = np.array([float(row["reward"]) for row in rows])
+    np.testing.assert_allclose(rewards.mean(), report["mean_reward"], rtol=1e-6)
+    np.testing.assert_allclose(rewards.std(), report["std_reward"], rtol=1e-6)
+    assert np.mean([int(row["violated"]) for row in rows]) == report["violation_rate"]
+    assert np.mean([row["settled"] == "0" for row in rows]) == report["non_settled_rate"]
+
+    assert f"{report['mean_reward']:.2f} +- {report['std_reward']:.2f}" in output
+    assert "7281.91 +- 688.85" in output  # the paper's
+    assert re.search(r"not settled .*100\.00 %  \[\d+\.\d\d, 100\.00\]", output)
+    assert re.search(r"compiled in \d+\.\d s, flown in \d+\.\d s", output)
+    assert sorted(path.name for path in empty_cwd.iterdir()) == ["x.csv", "x.json"]
+
+
+def test_files_are_replaced_whole(agent, empty_cwd):
+    (empty_cwd / "x.json").write_text("old" * 10_000)
+    assert tiny.status("evaluate", "--agent", agent, "--cases", tiny.CASES, "--json", "x.json") == 0
+    assert json.loads((empty_cwd / "x.json").read_text())["cases"] == tiny.CASES
+
+
+def test_a_replayed_case_ends_like_its_row(capsys, run, empty_cwd):
+    draw = ["--agent", run.path, "--cases", tiny.CASES, "--seed", 5]
+    assert tiny.status("evaluate", *draw, "--csv", "all.csv") == 0
+    assert tiny.status("evaluate", *draw, "--replay-case", 3) == 0
+    assert tiny.status("evaluate", *draw, "--replay-case", 3, "--history", "other.csv") == 0
+    rows = list(csv.DictReader((empty_cwd / "all.csv").read_text().splitlines()))
+    history = list(csv.DictReader((empty_cwd / "case-3.csv").read_text().splitlines()))
+    row, start, end = rows[3], history[0], history[-1]
+    assert float(start["phi_deg"]) == pytest.approx(float(row["initial_angle_deg"]), rel=1e-5)
+    assert float(end["phi_deg"]) == pytest.approx(float(row["control_accuracy_deg"]), rel=1e-4)
+    margins = [float(instant["theta_margin_deg"]) for instant in history]
+    assert min(margins) == pytest.approx(float(row["min_margin_deg"]), rel=1e-4)
+    effort = sum(0.1 * float(instant[f"torque_{axis}_Nm"]) ** 2 for instant in history[:-1] for axis in "xyz")
+    assert effort == pytest.approx(float(row["control_effort_N2m2s"]), rel=1e-4)
+    assert (empty_cwd / "other.csv").read_text() == (empty_cwd / "case-3.csv").read_text()
+    output = capsys.readouterr().out
+    assert f"case 3: {float(row['initial_angle_deg']):.1f} deg, not settled" in output
+    assert "history: case-3.csv" in output and "history: other.csv" in output
+
+
+def test_the_rules_can_be_changed(capsys, agent, empty_cwd):
+    argv = ["--agent", agent, "--cases", tiny.CASES]
+    for convention in ("full", "half"):
+        assert tiny.status("evaluate", *argv, "--angle-convention", convention, "--csv", f"{convention}.csv") == 0
+    full, half = (
+        [
+            float(row["control_accuracy_deg"])
+            for row in csv.DictReader((empty_cwd / f"{name}.csv").read_text().splitlines())
+        ]
+        for name in ("full", "half")
+    )
+    np.testing.assert_allclose(half, 0.5 * np.array(full), rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_the_command_itself(run, empty_cwd):
+    done = tiny.run_python(
+        tiny.ROOT / "eval_mc.py", "--agent", run.path, "--cases", 12, "--json", "x.json", cwd=empty_cwd
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "12 cases" in done.stdout
+    assert list(json.loads((empty_cwd / "x.json").read_text())) == JSON_KEYS

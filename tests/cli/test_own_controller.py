@@ -1,0 +1,152 @@
+"""A controller of one's own in a file: flown with and without the shield, and refused in a line where it cannot fly."""
+
+import csv
+from pathlib import Path
+
+import pytest
+from support import tiny
+
+from koz_jax.control.registry import load_controller
+from koz_jax.errors import SettingsError
+
+MINE = '''
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from koz_jax.control.base import Memoryless
+from koz_jax.task.state import attitude_error, torque_limits
+
+
+class Mine(Memoryless):
+    """A spring and a damper."""
+
+    spring: float = 60.0
+    damper: float = 120.0
+
+    def decide(self, state, model, memory):
+        torque_B = -self.spring * attitude_error(state)[1:] - self.damper * state.body.omega_BN_B
+        return jnp.clip(torque_B / torque_limits(state, model).box_B, -1.0, 1.0), memory
+
+
+class Numpy(Memoryless):
+    def decide(self, state, model, memory):
+        return np.clip(-np.asarray(state.body.omega_BN_B), -1.0, 1.0), memory
+
+
+class Branching(Memoryless):
+    def decide(self, state, model, memory):
+        return (jnp.ones(3) if state.angle > 1.0 else jnp.zeros(3)), memory
+
+
+class NoTree:
+    def begin(self, state, model, key): ...
+
+    def decide(self, state, model, memory):
+        return jnp.zeros(3), memory
+
+
+class TooMany(Memoryless):
+    def decide(self, state, model, memory):
+        return jnp.zeros(4), memory
+
+
+class Growing(struct.PyTreeNode):
+    def begin(self, state, model, key):
+        return jnp.zeros(1)
+
+    def decide(self, state, model, memory):
+        return jnp.zeros(3), jnp.zeros(2)
+
+
+class Undecided(Memoryless):
+    pass
+
+
+class Needy(Memoryless):
+    gain: float
+
+    def decide(self, state, model, memory):
+        return jnp.zeros(3), memory
+
+
+class Wrong(Memoryless):
+    def decide(self, state, model, memory):
+        return state.nothing, memory
+'''
+
+
+@pytest.fixture
+def file(tmp_path) -> Path:
+    path = tmp_path / "own.py"
+    path.write_text(MINE)
+    return path
+
+
+def test_it_is_flown_with_and_without_the_shield(file, agent, empty_cwd, capsys):
+    argv = ["--agent", agent, "--controller", f"{file}:Mine", "--cases", tiny.CASES]
+    assert tiny.status("evaluate", *argv, "--csv", "bare.csv") == 0
+    assert "  Mine\n" in capsys.readouterr().out
+    assert tiny.status("evaluate", *argv, "--shield", "--csv", "shielded.csv") == 0
+    assert "  Mine + shield\n" in capsys.readouterr().out
+    bare, shielded = (list(csv.DictReader((empty_cwd / f"{name}.csv").open())) for name in ("bare", "shielded"))
+    assert {row["intervention_rate"] for row in bare} == {"0"}
+    assert len(shielded) == tiny.CASES and all(float(row["min_margin_deg"]) > 0 for row in shielded)
+
+
+@pytest.mark.slow
+def test_the_shield_keeps_it_out_of_every_zone(file, empty_cwd):
+    argv = ["--controller", f"{file}:Mine", "--cases", tiny.CASES]
+    violated = []
+    for name, flags in (("bare", []), ("shielded", ["--shield"])):
+        assert tiny.status("evaluate", *argv, *flags, "--csv", f"{name}.csv") == 0
+        violated.append(sum(row["violated"] == "1" for row in csv.DictReader((empty_cwd / f"{name}.csv").open())))
+    assert violated[0] > 0 == violated[1]
+
+
+@pytest.mark.slow
+def test_it_can_be_looked_at(file, agent, tmp_path, capsys):
+    argv = ["--agent", agent, "--controller", f"{file}:Mine", "--out"]
+    assert tiny.status("fly", *argv, tmp_path / "figures") == 0
+    assert tiny.status("view", *argv, tmp_path / "page.html", "--shield") == 0
+    assert "Mine + shield: 100.0 deg" in capsys.readouterr().out
+    assert "Mine + shield" in (tmp_path / "page.html").read_text()
+
+
+def test_it_decides_as_it_is_written(file):
+    named = load_controller(f"{file}:Mine")
+    assert named.name == "Mine"
+    assert float(named.controller.spring) == 60.0  # pyright: ignore[reportAttributeAccessIssue]
+    assert named.task == load_controller("pd").task
+
+
+BAD = {
+    "own.py:Numpy": ["cannot be traced", "use jax.numpy in place of numpy", "own.py, line"],
+    "own.py:Branching": ["cannot be traced", "jax.numpy.where", "own.py, line"],
+    "own.py:NoTree": ["must be a pytree", "koz_jax.control.base.Memoryless or flax.struct.PyTreeNode"],
+    "own.py:TooMany": ["the action of own.py:TooMany must be 3 real numbers", "(4,)"],
+    "own.py:Growing": ["the memory of own.py:Growing must keep its shapes", "float32[1]", "float32[2]"],
+    "own.py:Undecided": ["has no method decide"],
+    "own.py:Needy": ["cannot be made without arguments", "'gain'"],
+    "own.py:Wrong": ["cannot decide: AttributeError", "nothing", "own.py, line"],
+    "own.py:Nobody": ["own.py has no class 'Nobody'; it has Mine, Numpy"],
+    "own.py:jnp": ["own.py has no class 'jnp'"],
+    "own.py": ["must be FILE.py:CLASS, got own.py"],
+    "other.py:Mine": ["other.py: no such file"],
+    "broken.py:Mine": ["broken.py: cannot be imported: SyntaxError", "broken.py, line 1"],
+    "alone.py:Mine": ["alone.py: cannot be imported: ModuleNotFoundError", "no_such_module", "alone.py, line 1"],
+    "text.txt:Mine": ["must be a Python file"],
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_cannot_fly_is_refused_in_a_line(name, file, monkeypatch):
+    monkeypatch.chdir(file.parent)
+    (file.parent / "broken.py").write_text("x = (\n")
+    (file.parent / "alone.py").write_text("import no_such_module\n")
+    (file.parent / "text.txt").touch()
+    with pytest.raises(SettingsError) as refused:
+        load_controller(name)
+    message = str(refused.value)
+    assert message.startswith("controller: ") and len(message.splitlines()) == 1
+    for words in BAD[name]:
+        assert words in message

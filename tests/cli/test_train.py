@@ -1,0 +1,318 @@
+"""``koz train`` as a user meets it: its help, its errors, its signals, its output."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import pytest
+from support import tiny
+
+import koz_jax.runs.trainer
+from koz_jax.cli.train import TrainFlags, parse
+from koz_jax.config.base import Settings
+from koz_jax.config.presets import PRESETS, preset
+from koz_jax.config.training import TrainConfig
+from koz_jax.learning import train_step
+from koz_jax.runs import checkpoint, memory
+from koz_jax.runs.folder import RunFolder
+from koz_jax.storage import archive, files
+
+
+@pytest.fixture
+def no_training(monkeypatch) -> None:
+    """Make an error of any training."""
+    monkeypatch.setattr(train_step, "init", lambda *_: pytest.fail("networks were made"))
+    monkeypatch.setattr(train_step, "train_chunk", lambda *_: pytest.fail("something was learned"))
+
+
+def no_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out what is not about the command line: shapes and what they take of the memory."""
+    monkeypatch.setattr(checkpoint, "template", mock.MagicMock())
+    monkeypatch.setattr(memory, "check", lambda *_: None)
+
+
+def refused(capsys: Any, *argv: object) -> str:
+    """What a command line that is refused says."""
+    assert tiny.status("train", *argv) == 2
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert "Traceback" not in output.err
+    assert 0 < len(output.err.splitlines()) <= 12
+    return output.err
+
+
+def fields(settings: Settings, prefix: str = "--") -> Iterator[tuple[str, str]]:
+    """Flag and description of every field."""
+    for name, field in type(settings).model_fields.items():
+        flag = prefix + name.replace("_", "-")
+        value = getattr(settings, name)
+        if isinstance(value, Settings):
+            yield from fields(value, f"{flag}.")
+        else:
+            yield flag, field.description or "no description"
+
+
+INERTIA = "--task.spacecraft.inertia"
+# Arguments, and what the message must say: the field, the value, what is allowed.
+BAD = [
+    (f"{INERTIA} 1 0 0 0 1 0 0 0 -1", ["task.spacecraft", "inertia must be positive definite", "-1.0"]),
+    (f"{INERTIA} 1 0.5 0 0 1 0 0 0 1", ["task.spacecraft", "inertia must be symmetric", "0.5"]),
+    (f"{INERTIA} 1 0 0 0 1 0 0 0 3", ["task.spacecraft", "inertia must obey the triangle inequality", "3.0"]),
+    (f"{INERTIA} 1 0 0", [INERTIA, "Expected 9 values"]),
+    ("--task.spacecraft.boresight 1 1 0", ["task.spacecraft", "boresight must be a unit vector", "(1.0, 1.0, 0.0)"]),
+    ("--task.scenario.max-half-angle-deg 180", ["task.scenario.max_half_angle_deg", "less than 180", "got 180.0"]),
+    ("--task.scenario.min-half-angle-deg 0", ["task.scenario.min_half_angle_deg", "greater than 0", "got 0.0"]),
+    ("--task.angle-convention quarter", ["--task.angle-convention", "quarter", "full", "half"]),
+    ("--eval-min-angle-deg 170 --eval-max-angle-deg 100", ["eval_min_angle_deg must be at most", "170.0", "100.0"]),
+    ("--curriculum.phase1.max-angle-deg 0 10 0.5 300", ["curriculum.phase1", "max_angle_deg", "180", "300"]),
+    ("--curriculum.phase1.max-angle-deg 0 10 0.5", ["--curriculum.phase1.max-angle-deg"]),
+    ("--sac.batch-size 300 --sac.buffer-size 200", ["sac.batch_size must be at most sac.buffer_size", "300", "200"]),
+    ("--sac.reward-scale nan", ["sac.reward_scale", "finite number", "nan"]),
+    ("--sac.reward-scale inf", ["sac.reward_scale", "finite number", "inf"]),
+    ("--seed -1", ["seed", "greater than or equal to 0", "got -1"]),
+    ("--seed 99999999999999999999", ["seed", "less than 4294967296", "9999999999"]),
+    ("--seed nan", ["seed: Input should be a finite number", "nan"]),
+    ("--num-envs abc", ["num_envs: Input should be a valid integer", "abc"]),
+    ("--num-envs 0", ["num_envs", "greater than 0", "got 0"]),
+    ("--cases 0", ["cases: Input should be greater than 0 (got 0)"]),
+    ("--cases -5", ["cases: Input should be greater than 0 (got -5)"]),
+    ("--cases abc", ["cases: Input should be a valid integer", "abc"]),
+    ("--preset quick", [f"preset: unknown preset 'quick'; allowed: {', '.join(PRESETS)}"]),
+    ("--preset", [f"preset: unknown preset ''; allowed: {', '.join(PRESETS)}"]),
+    ("--colour red", ["--colour"]),
+    ("surplus", ["surplus"]),
+    ("--resume nowhere", ["resume: nowhere is not a run folder (it has no config.json)"]),
+    ("--resume .", ["resume: . is not a run folder (it has no config.json)"]),
+    ("--resume", ["--resume"]),
+    (f"--resume {'x' * 300}", ["resume: xxx", "is not a run folder"]),
+    ("--start-from nowhere", ["start_from: nowhere is neither a run with a checkpoint nor a snapshot"]),
+]
+
+
+@pytest.mark.parametrize(("argv", "words"), BAD, ids=[argv[:60] for argv, _ in BAD])
+@pytest.mark.usefixtures("no_training")
+def test_bad_input_is_refused_by_name_before_anything_happens(capsys, monkeypatch, empty_cwd, argv, words):
+    no_shapes(monkeypatch)
+    message = refused(capsys, *argv.split())
+    for word in words:
+        assert word in message
+    assert list(empty_cwd.iterdir()) == []
+
+
+def test_bad_settings_are_refused_before_jax_is_even_loaded(tmp_path):
+    argvs = [argv.split() for argv, words in BAD if "resume" not in argv and "start-from" not in argv]
+    code = (
+        "import sys\nfrom koz_jax.cli.main import main\n"
+        f"for argv in {argvs!r}:\n"
+        "    try: status = main(['train', *argv])\n"
+        "    except SystemExit as end: status = end.code\n"
+        "    assert status == 2, argv\n"
+        "assert 'jax' not in sys.modules\n"
+    )
+    done = tiny.run_python("-c", code, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_several_bad_settings_are_reported_at_once(capsys, empty_cwd):
+    message = refused(capsys, "--num-envs", 0, "--sac.n-step", 0, "--task.step-seconds", -1)
+    assert [line.split(":")[:2] for line in message.splitlines()] == [
+        ["error", " task.step_seconds"],
+        ["error", " sac.n_step"],
+        ["error", " num_envs"],
+    ]
+
+
+@pytest.mark.usefixtures("no_training")
+def test_an_existing_run_is_not_overwritten(capsys, run, empty_cwd):
+    before = tiny.contents(run.path)
+    message = refused(capsys, "--run", run.path)
+    assert (
+        message
+        == f"error: run: {run.path} exists already; resume it with --resume {run.path}, or choose another folder\n"
+    )
+    (empty_cwd / "mine.txt").write_text("my work")
+    assert "run: . exists already" in refused(capsys, "--run", ".")
+    assert f"run: {run.config} exists already" in refused(capsys, "--run", run.config)
+    assert tiny.contents(run.path) == before
+    assert tiny.contents(empty_cwd) == {empty_cwd / "mine.txt": b"my work"}
+
+
+@pytest.mark.usefixtures("no_training")
+def test_a_run_folder_that_cannot_be_made_is_named(capsys, empty_cwd):
+    (empty_cwd / "file").write_text("")
+    assert "run: file/run cannot be created: Not a directory" in refused(capsys, "--run", "file/run")
+    if Path("/proc/self").exists():  # a place where not even root may write
+        assert "run: /proc/run cannot be created: " in refused(capsys, "--run", "/proc/run")
+
+
+@pytest.mark.parametrize(
+    "others",
+    ["--seed 3", "--preset paper", "--preset=fast", "--run other", "--start-from other", "--num-envs=4", "--preset"],
+)
+@pytest.mark.usefixtures("no_training")
+def test_resume_takes_no_other_settings(capsys, run, empty_cwd, others):
+    before = tiny.contents(run.path)
+    for argv in (["--resume", run.path, *others.split()], [*others.split(), f"--resume={run.path}"]):
+        message = refused(capsys, *argv)
+        assert "resume" in message and others.replace("=", " ").split()[0] in message
+    assert tiny.contents(run.path) == before
+
+
+@pytest.mark.usefixtures("no_training")
+def test_a_tampered_run_is_not_resumed(capsys, run, tmp_path, monkeypatch):
+    no_shapes(monkeypatch)
+    content = json.loads(run.config.read_text())
+    for change, reason in [
+        ({"num_envs": 0}, "num_envs: Input should be greater than 0 (got 0)"),
+        ({"colour": "red"}, "colour: Extra inputs are not permitted (got 'red')"),
+        ({"seed": 5}, "resume: seed is 5, but"),
+    ]:
+        folder = RunFolder(tmp_path / next(iter(change)))
+        folder.path.mkdir()
+        folder.config.write_text(json.dumps(content | change))
+        archive.save_tree(folder.checkpoint(0), {}, {"config": content})
+        assert reason in refused(capsys, "--resume", folder.path)
+
+
+def test_help_names_and_describes_every_setting(capsys):
+    assert tiny.status("train", "--help") == 0
+    text = capsys.readouterr().out
+    flags = set(re.findall(r"--[a-z0-9.-]+", text))
+    # Wrapped lines and their frame do not count.
+    text = re.sub(r"[\s│]", "", text)
+    described = list(fields(preset("fast")))
+    assert len(described) > 60
+    for flag, description in described:
+        assert flag in flags
+        if flag != "--preset":
+            assert re.sub(r"\s", "", description) in text, flag
+    assert f"Settingstobeginfrom:{','.join(PRESETS)}" in text
+    assert {"--run", "--resume", "--start-from", "--cases"} <= flags
+
+
+def test_help_cut_short_by_its_reader_ends_quietly():
+    with subprocess.Popen(
+        [sys.executable, tiny.ROOT / "train.py", "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 141
+
+
+def test_help_of_a_preset_shows_its_values(capsys):
+    for argv in (["--preset", "paper", "--help"], ["--preset", "paper", "--resume", "x", "-h"]):
+        assert tiny.status("train", *argv) == 0
+        assert "(default: 1000000)" in capsys.readouterr().out
+
+
+def test_every_setting_can_be_given_as_a_flag():
+    for name in PRESETS:
+        other = "fast" if name == "paper" else "paper"
+        wanted = preset(name)
+        settings = wanted.model_dump()
+        del settings["preset"]
+        config, _ = parse(["--preset", other, *tiny.flags(settings)])
+        assert config == wanted.model_copy(update={"preset": other})
+    assert parse([]) == (preset("fast"), TrainFlags())
+    assert parse(tiny.FLAGS)[0] == tiny.CONFIG
+
+
+def test_arguments_reach_the_training(monkeypatch, capsys, empty_cwd):
+    calls = []
+
+    def train(config: TrainConfig, run: Path, **options: Any) -> None:
+        calls.append((config, run, options))
+
+    monkeypatch.setattr(koz_jax.runs.trainer, "train", train)
+    assert tiny.status("train", "--seed", 7, "--preset", "paper", "--start-from", "other") == 0
+    assert tiny.status("train", "--run", "my run") == 0
+    (config, run, options), (_, named, _) = calls
+    assert config == preset("paper").model_copy(update={"seed": 7})
+    assert options == {
+        "resume": False,
+        "start_from": Path("other"),
+        "devices": 1,
+        "command": "koz train --seed 7 --preset paper --start-from other",
+    }
+    assert re.fullmatch(r"runs/paper-seed7-\d{8}-\d{6}", str(run))
+    assert named == Path("my run")
+    assert capsys.readouterr().err.splitlines() == [
+        f"stopped; go on with: koz train --resume {run}",
+        "stopped; go on with: koz train --resume 'my run'",
+    ]
+
+
+def test_ctrl_c_outside_training_ends_without_a_traceback(monkeypatch, capsys, empty_cwd):
+    def train(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(koz_jax.runs.trainer, "train", train)
+    assert tiny.status("train") == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+# Runs train.py on one core (as the run it is compared with), and sends it a signal when so much is done.
+DRIVER = """
+import os, runpy, signal, sys
+if hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+from koz_jax.runs.progress import Progress
+stop_at, sys.argv = int(sys.argv[1]), sys.argv[2:]
+advance = Progress.advance
+def advance_and_signal(bar, done):
+    advance(bar, done)
+    if done == stop_at:
+        os.kill(os.getpid(), signal.SIGTERM)
+Progress.advance = advance_and_signal
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+def drive(stop_at: int, *argv: object) -> subprocess.CompletedProcess[str]:
+    return tiny.run_python("-c", DRIVER, stop_at, tiny.ROOT / "train.py", *argv)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the number of devices would not be the same")
+def test_a_run_ended_by_sigterm_and_resumed_equals_the_undisturbed_one(run, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    stopped = drive(48, "--run", folder.path, *tiny.FLAGS)
+    assert (stopped.returncode, stopped.stdout) == (0, ""), stopped.stderr
+    assert "SIGTERM: finishing the chunk, then checkpointing" in stopped.stderr
+    assert f"run folder: {folder.path}" in stopped.stderr
+    assert f"stopped; go on with: python {tiny.ROOT / 'train.py'} --resume {folder.path}" in stopped.stderr
+    assert json.loads((folder.checkpoints()[0] / "record.json").read_text())["done"] == 48
+    assert folder.read_config() == run.read_config() == tiny.CONFIG
+
+    resumed = drive(-1, "--resume", folder.path, "--cases", tiny.CASES)
+    assert resumed.returncode == 0, resumed.stderr
+    for saved in ("checkpoints/0000000136", "snapshots/phase1", "agents/phase1", "agents/phase2", "agents/phase2-sac"):
+        with np.load(folder.path / saved / "arrays.npz") as found, np.load(run.path / saved / "arrays.npz") as expected:
+            assert found.files == expected.files
+            for name in found.files:
+                np.testing.assert_array_equal(found[name], expected[name], err_msg=f"{saved} {name}", strict=True)
+    assert (folder.path / "metrics.csv").read_bytes() == (run.path / "metrics.csv").read_bytes()
+
+    # It ends with the table, its numbers as JSON, and a hint.
+    assert f"{tiny.CASES} cases" in resumed.stdout and "mean reward" in resumed.stdout
+    assert resumed.stdout.rstrip().endswith(f"python {tiny.ROOT / 'eval_mc.py'} --agent {folder.path} --csv cases.csv")
+    evaluated = files.read_json(folder.evaluation)
+    assert (evaluated["cases"], evaluated["agent"]) == (tiny.CASES, str(folder.path))
+
+
+def test_a_finished_run_is_evaluated_again(run, tmp_path, capsys, monkeypatch):
+    shutil.copytree(run.path, tmp_path / "run")
+    monkeypatch.setattr(train_step, "train_chunk", lambda *_: pytest.fail("something was learned"))
+    assert tiny.status("train", "--resume", tmp_path / "run", "--cases", tiny.CASES) == 0
+    assert f"{tiny.CASES} cases" in capsys.readouterr().out
+    assert files.read_json(RunFolder(tmp_path / "run").evaluation)["cases"] == tiny.CASES

@@ -1,0 +1,110 @@
+"""Figures of one maneuver: what is drawn is true, and is written."""
+
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+import pytest
+from support import tiny
+from support.drawn import angle_deg, flown
+
+from koz_jax.evaluation import cases
+from koz_jax.figures import animation, geometry, histories, palette, sphere, style
+from koz_jax.task import scenario
+from koz_jax.task.observation_layout import ABSENT_HALF_ANGLE
+from koz_jax.task.scenario import Scenario
+
+TASK = tiny.CONFIG.task
+
+
+def test_the_zone_on_the_page_has_the_true_radius():
+    history, _, task = flown()
+    traces = geometry.sphere_traces(history)
+    axes = sphere.draw(history, task).axes[0]
+    (line,) = [line for line in axes.lines if str(line.get_label()).startswith("keep-out zone")]
+    x, y = np.array(line.get_data(), float)
+    assert np.isfinite(x).all(), "all of the circle faces the viewer"
+    on_sphere = np.stack([x, y, np.sqrt(1.0 - x**2 - y**2)], axis=1)
+    axis = traces.view.project(traces.zones[0].axis_N)
+    np.testing.assert_allclose(angle_deg(on_sphere, axis), 15.2, atol=1e-4)
+
+
+def test_start_and_end_are_marked_as_in_the_paper():
+    history, _, task = flown("phase2")
+    axes = sphere.draw(history, task).axes[0]
+    traces = geometry.sphere_traces(history)
+    marks = {str(line.get_label()).split(",")[0]: line for line in axes.lines if line.get_marker() in ("x", "o")}
+    ends = {"start": (0, "x", palette.START), "end": (-1, "o", palette.TARGET)}
+    for name, (instant, marker, color) in ends.items():
+        assert (marks[name].get_marker(), marks[name].get_color()) == (marker, color)
+        right, up, _ = traces.view.project(traces.trace_N[instant])
+        np.testing.assert_allclose(np.array(marks[name].get_data(), float).ravel(), [right, up])
+
+
+def test_histories_are_in_the_units_on_their_axes():
+    history, result, task = flown("phase2")
+    figure = histories.draw(history, result, task, "title")
+    attitude, rate, torque, margin = figure.axes
+    assert [axes.get_ylabel().split("[")[-1] for axes in figure.axes] == ["-]", "deg/s]", "N m]", "deg]"]
+    assert margin.get_xlabel() == "time [s]" and margin.get_xlim() == pytest.approx((0.0, 100.0))
+    drawn = {line.get_label(): np.array(line.get_ydata(), float) for axes in figure.axes for line in axes.lines}
+    np.testing.assert_allclose(drawn["$q_{e0}$"], history.attitude_error[:, 0])
+    np.testing.assert_allclose(drawn[r"$\omega_y$"], np.rad2deg(history.state.body.omega_BN_B[:, 1]), rtol=1e-6)
+    np.testing.assert_allclose(drawn[r"$\tau_z$"], history.torque_B[:, 2])
+    np.testing.assert_allclose(drawn[r"$\theta_\mathrm{margin}$"], np.rad2deg(history.zone_margin), rtol=1e-6)
+    settled = [line for line in rate.lines if line.get_linestyle() == ":"]
+    assert np.array(settled[0].get_xdata())[0] == pytest.approx(float(result.settling_time))
+    assert len(attitude.texts) == 1 and torque.get_ylim()[1] > 2.0
+
+
+def test_a_case_without_a_zone_says_so():
+    paper = scenario.paper_test()
+    drawn = Scenario(paper.initial, paper.q_DN, paper.constraints.replace(half_angle=jnp.array([ABSENT_HALF_ANGLE])))
+    history, result = cases.fly_scenario(tiny.untrained_agent(), drawn)
+    assert geometry.zones(history) == []
+    assert "no keep-out zone" in histories.draw(history, result, TASK).axes[3].texts[0].get_text()
+    labels = [str(line.get_label()) for line in sphere.draw(history, TASK).axes[0].lines]
+    assert not any("keep-out" in label for label in labels)
+    assert animation.gif(history, result, TASK).startswith(b"GIF")
+
+
+@pytest.mark.slow
+def test_the_same_figure_gives_the_same_bytes(tmp_path):
+    history, result, task = flown()
+    contents = []
+    for name in ("one", "other"):
+        (tmp_path / name).mkdir()
+        files = style.save(histories.draw(history, result, task), tmp_path / name, "histories")
+        contents.append([path.read_bytes() for path in files])
+    assert contents[0] == contents[1]
+
+
+def test_the_moving_picture_is_short_and_small():
+    history, result, task = flown("phase2")
+    content = animation.gif(history, result, task, "a title")
+    assert len(content) <= 2_000_000
+    instants = animation.shown_instants(history, result, task)
+    assert instants[0] == 0 and 0 <= instants[-1] * 0.1 - float(result.settling_time) - 3.0 < 0.1
+    not_settled = result.replace(settled=jnp.array(False), settling_time=jnp.nan)
+    instants = animation.shown_instants(history, not_settled, task)
+    assert instants[-1] == 1000 and len(instants) <= 251
+
+
+def test_drawing_leaves_the_settings_of_matplotlib_alone():
+    history, result, task = flown()
+    before = dict(matplotlib.rcParams)
+    histories.draw(history, result, task)
+    assert dict(matplotlib.rcParams) == before
+
+
+def test_unequal_limits_are_drawn_in_the_colours_of_their_axes():
+    history, result, task = flown()
+    unequal = task.model_copy(
+        update={"spacecraft": task.spacecraft.model_copy(update={"torque_limit": (2.0, 1.0, 0.5)})}
+    )
+    torque = histories.draw(history, result, unequal).axes[2]
+    dashed = {
+        (abs(np.array(line.get_ydata())[0]), line.get_color()) for line in torque.lines if line.get_linestyle() == "--"
+    }
+    assert dashed == {*zip((2.0, 1.0, 0.5), palette.BODY_AXES, strict=True)}
+    assert torque.get_ylim()[1] > 2.0
+    assert animation.gif(history, result, unequal).startswith(b"GIF")
