@@ -2,7 +2,9 @@
 
 import dataclasses
 import functools
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -58,21 +60,31 @@ def _act(controller: PolicyController, observed: jax.Array) -> jax.Array:
     return controller.act(observed)
 
 
-def load_agent(name: str | Path = "phase2", task: TaskConfig | None = None) -> Agent:
+def load_agent(
+    name: str | Path = "phase2",
+    task: TaskConfig | None = None,
+    normalization: Path | str | Mapping[str, Any] | None = None,
+) -> Agent:
     """Load an agent by name or folder, see ``find_agent``; or a zip of Stable-Baselines3, see ``agents.sb3``.
 
-    task: what the agent of a zip was trained for, by default the paper's; agents of ours know theirs.
+    Args:
+        name: of a shipped agent; a folder; or a zip.
+        task: what the agent of a zip was trained for, by default the paper's; agents of ours know theirs.
+        normalization: statistics of a zip that was trained under VecNormalize: a file .npz or .json, or a mapping, with
+            mean, var, epsilon and clip, see ``agents.normalization``.
 
     Raises:
-        SettingsError: there is no such agent, its files are damaged, or it is not of the task.
+        SettingsError: there is no such agent, its files are damaged, it is not of the task, or the statistics of its
+            observations are missing.
 
     """
     if is_sb3(name):
-        record, arrays = read_sb3(name, task or TaskConfig())
+        record, arrays = read_sb3(name, task or TaskConfig(), normalization)
         policy = unflatten_dict({leaf: jnp.asarray(array) for leaf, array in arrays.items()}, sep="/")
         return Agent(PolicyController(policy, record.network), record.task, record.provenance, str(name))
-    if task is not None:
-        raise SettingsError(f"task: is told for zips of Stable-Baselines3 only, got one for {name}")
+    for what, told in {"task": task, "normalization": normalization}.items():
+        if told is not None:
+            raise SettingsError(f"{what}: is told for zips of Stable-Baselines3 only, got one for {name}")
     folder = find_agent(name)
     record = read_agent_record(folder)
     template = jax.eval_shape(

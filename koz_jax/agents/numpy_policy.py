@@ -2,6 +2,9 @@
 
 >>> policy = load_policy("phase2")
 >>> torque_B = policy.record.task.spacecraft.torque_limits * policy.predict(observation)
+
+The observation keeps the sign of q_e from step to step, also where that of a measured attitude jumps;
+``numpy_observer`` makes it so of what is measured.
 """
 
 import dataclasses

@@ -31,6 +31,8 @@ class Provenance(Settings):
     """Gradient updates after which it was taken."""
     refinements: int = 0
     """Refinement iterations after those."""
+    refinements_tried: int = 0
+    """Refinement iterations that the run came to; with 0 ``refinements``, none of them gave a better agent."""
     table: dict[str, float | int | str] = Field(default={})
     """Its Monte Carlo table."""
 

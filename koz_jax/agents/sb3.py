@@ -2,24 +2,35 @@
 
 Of a zip, only the weights are read (by torch, which refuses anything else) and the plain text of its settings, never
 the pickles in them.  What cannot be seen there is taken for granted: the observation is ours, in our order
-(``observation_layout.LAYOUT``), not normalised by a wrapper such as VecNormalize.  The task is told by the caller;
-where bounds of observations in the zip are finite, as those of our environments are, they must be those of the task.
+(``observation_layout.LAYOUT``).  The task is told by the caller; where bounds of observations in the zip are finite, as
+those of our environments are, they must be those of the task.
+
+A zip holds the last observation of its training, whose quaternion and boresight are of unit length unless a wrapper
+such as VecNormalize has changed them.  Such a zip needs its statistics, see ``normalization``.
 """
 
+import base64
 import json
+import logging
+import pickletools
 import re
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
+from koz_jax.agents.normalization import Normalization, fold, read_normalization
 from koz_jax.agents.numpy_policy import layer_names
 from koz_jax.agents.record import Provenance, Record
 from koz_jax.config.task import TaskConfig
 from koz_jax.config.training import NO_ENCODING, NetworkConfig
 from koz_jax.errors import DamagedFileError, SettingsError, missing_extra
-from koz_jax.task.observation_layout import ACTION_SIZE, observation_bounds, size
+from koz_jax.task.observation_layout import ACTION_SIZE, SLICES, observation_bounds, size
+
+_log = logging.getLogger(__name__)
 
 _LAYER = re.compile(r"actor\.latent_pi\.(\d+)\.weight")
 
@@ -29,14 +40,21 @@ def is_sb3(name: str | Path) -> bool:
     return Path(name).suffix == ".zip"
 
 
-def read_sb3(path: str | Path, task: TaskConfig) -> tuple[Record, dict[str, np.ndarray]]:
-    """Record and arrays as those of an agent's folder.  task: what it was trained for.
+def read_sb3(
+    path: str | Path, task: TaskConfig, normalization: Path | str | Mapping[str, Any] | None = None
+) -> tuple[Record, dict[str, np.ndarray]]:
+    """Record and arrays as those of an agent's folder.
+
+    task: what it was trained for; normalization: statistics of VecNormalize, see ``read_normalization``.
 
     Raises:
-        SettingsError: it is no SAC policy for the task's observation and for our action, or torch is not installed.
+        SettingsError: it is no SAC policy for the task's observation and for our action, torch is not installed, or
+            its observations were normalised and there are no statistics, or the other way round.
 
     """
-    weights = _read(Path(path), task)
+    zones = task.scenario.max_zones
+    statistics = None if normalization is None else read_normalization(normalization, zones)
+    weights, settings = _read(Path(path), task)
     # Layers are numbered together with the activations between them.
     numbers = sorted(int(found[1]) for name in weights if (found := _LAYER.fullmatch(name)))
     names = [f"actor.latent_pi.{number}" for number in numbers]
@@ -52,15 +70,18 @@ def read_sb3(path: str | Path, task: TaskConfig) -> tuple[Record, dict[str, np.n
     biases = [weights[f"{name}.bias"] for name in names]
     kernels.append(np.concatenate([weights[f"{head}.weight"].T for head in heads], axis=1))
     biases.append(np.concatenate([weights[f"{head}.bias"] for head in heads]))
-    zones = task.scenario.max_zones
     _check_sizes(path, kernels, zones)
+    _check_normalization(path, settings, statistics, zones)
+    if statistics is not None:
+        kernels[0], biases[0] = fold(kernels[0], biases[0], statistics, task)
     arrays = {}
     for number, (kernel, bias) in enumerate(zip(kernels, biases, strict=True)):
         kernel_name, bias_name = layer_names(number)
         arrays |= {kernel_name: np.ascontiguousarray(kernel, np.float32), bias_name: np.asarray(bias, np.float32)}
     hidden_sizes = tuple(len(bias) for bias in biases[:-1])
     network = NetworkConfig(hidden_sizes=hidden_sizes, encoding=NO_ENCODING, observed_zones=zones)
-    provenance = Provenance(command=f"Stable-Baselines3, read from {Path(path).name}")
+    folded = "" if statistics is None else ", with the statistics of its observations"
+    provenance = Provenance(command=f"Stable-Baselines3, read from {Path(path).name}{folded}")
     return Record(network=network, task=task, provenance=provenance), arrays
 
 
@@ -76,18 +97,70 @@ def _check_sizes(path: str | Path, kernels: list[np.ndarray], zones: int) -> Non
         raise SettingsError(f"{path}: its weights must be finite")
 
 
-def _read(path: Path, task: TaskConfig) -> dict[str, np.ndarray]:
-    """Weights of the actor by name, after a look at the settings."""
+def _check_normalization(
+    path: str | Path, settings: dict[str, Any], statistics: Normalization | None, zones: int
+) -> None:
+    """Refuse statistics that are missing or too many, as far as the last observation of the training tells."""
+    last = _array_in(settings, "_last_obs", size(zones))
+    as_ours = None if last is None else _has_unit_vectors(last)
+    if statistics is None and as_ours is False:
+        raise SettingsError(
+            f"{path}: its observations were changed by a wrapper such as VecNormalize, so it would fly wrongly; give"
+            " the statistics: load_agent(..., normalization=...) with a file or mapping of mean, var, epsilon and clip"
+        )
+    if statistics is None and as_ours is None:
+        _log.warning(
+            "%s: does not tell whether its observations were normalised; if they were (VecNormalize), it flies wrongly"
+            " without their statistics: load_agent(..., normalization=...)",
+            path,
+        )
+    if statistics is not None and as_ours:
+        raise SettingsError(f"normalization: {path} was trained on observations that are not normalised")
+    if statistics is not None and last is not None:
+        original = _array_in(settings, "_last_original_obs", size(zones))
+        if original is not None and not np.allclose(statistics(original), last, rtol=0.01, atol=0.05):
+            _log.warning(
+                "normalization: these are not the statistics with which %s was saved: of its last observation they make"
+                " something else, by up to %.3g",
+                path,
+                np.abs(statistics(original) - last).max(),
+            )
+
+
+def _has_unit_vectors(observations: npt.NDArray[np.float32]) -> bool:
+    """Whether q_e and the boresight are of unit length.  observations: (n, entries)."""
+    parts = [observations[:, SLICES[name]] for name in ("q_e", "boresight_B")]
+    return all(np.allclose(np.linalg.norm(part, axis=1), 1.0, atol=1e-3) for part in parts)
+
+
+def _array_in(settings: dict[str, Any], name: str, entries: int) -> npt.NDArray[np.float32] | None:
+    """Rows (n, entries) of an array that is pickled in the settings; None where there is none of that size.
+
+    The pickle is taken apart, and nothing in it is executed.
+    """
+    try:
+        operations = pickletools.genops(base64.b64decode(settings[name][":serialized:"]))
+        held = [bytes(argument) for _, argument, _ in operations if isinstance(argument, bytes | bytearray)]
+    except (KeyError, TypeError, ValueError):
+        return None
+    row, envs = 4 * entries, settings.get("n_envs")
+    buffers = [content for content in held if content and len(content) == row * (envs or 1)]
+    return np.frombuffer(buffers[0], "<f4").reshape(-1, entries) if len(buffers) == 1 else None
+
+
+def _read(path: Path, task: TaskConfig) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Weights of the actor by name, and the settings, which are looked at first."""
     try:
         import torch
     except ImportError as error:
         raise missing_extra(error, "torch", "sb3") from None
     try:
         with zipfile.ZipFile(path) as archive:
-            _check_settings(path, json.loads(archive.read("data")), task)
+            settings = json.loads(archive.read("data"))
+            _check_settings(path, settings, task)
             with archive.open("policy.pth") as file:
                 weights = torch.load(file, map_location="cpu", weights_only=True)
-            return {name: leaf.numpy() for name, leaf in weights.items() if name.startswith("actor.")}
+            return {name: leaf.numpy() for name, leaf in weights.items() if name.startswith("actor.")}, settings
     except FileNotFoundError:
         raise SettingsError(f"agent: {path}: no such file") from None
     except SettingsError:

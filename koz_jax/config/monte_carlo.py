@@ -32,6 +32,11 @@ class CaseConfig(Settings):
             )
         return self
 
+    @property
+    def is_papers_draw(self) -> bool:
+        """Whether the initial deviations are those of the paper."""
+        return (self.min_angle_deg, self.max_angle_deg) == (80.0, 180.0)
+
 
 class MonteCarloConfig(CaseConfig):
     """Which cases are flown, under what conditions, and how they are checked."""

@@ -33,8 +33,8 @@ class ShieldConfig(Settings):
         default=CERTAIN, validation_alias=AliasChoices("error_bounds", "withstands")
     )
     """Errors for which the guarantee holds."""
-    guide_rate_deg: PositiveFloat = 6.0
-    """Rate with which the boresight is led around a zone [deg/s]."""
+    guide_rate_deg: PositiveFloat | None = None
+    """Rate with which the boresight is led around a zone [deg/s]; by default what suits the spacecraft."""
     samples: PositiveInt = 12
     """Samples of a brake path: more are less cautious and slower."""
 

@@ -194,3 +194,22 @@ def check_feasible(task: TaskConfig, max_angle_deg: float, name: str = "max_angl
             f"{name}: must be above {needed:g} deg, so that a zone fits between start and target under the rule"
             f" 'resample'; got {max_angle_deg:g}. The rule 'shrink' leaves such zones out."
         )
+
+
+def is_paper_task(task: TaskConfig) -> bool:
+    """Whether the paper's numbers are of this task: same spacecraft, reward, scenarios, step and episode.
+
+    What the paper leaves open (the angle convention, what to do with a zone that has no room, whether a tie is
+    progress) does not count.
+    """
+    return _papers_part(task) == _papers_part(TaskConfig())
+
+
+def _papers_part(task: TaskConfig) -> tuple[dict[str, Any], Vector]:
+    left_open: dict[str, Any] = {
+        "angle_convention": True,
+        "scenario": {"infeasible_zone"},
+        "reward": {"progress_tolerance_deg"},
+        "spacecraft": {"torque_limit"},
+    }
+    return task.model_dump(exclude=left_open), task.spacecraft.torque_limits

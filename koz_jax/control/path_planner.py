@@ -31,18 +31,28 @@ _SIDES = 8
 _SPREADS = (0.3, 0.03)
 
 
+# Of the error at which the clock begins to slow down; at twice that it stands still.
+_LOST = 3.0
+
+
 class Plan(struct.PyTreeNode):
     """A path with its timing, and how far it has been flown."""
 
     path: AttitudePath
     timing: Timing
     clock: jax.Array  # () [s] of the plan; stands still while the body is too far from it
+    key: jax.Array  # () typed PRNG key of the next search
 
-    def reference(self, time: jax.Array) -> RigidBodyState:
-        """Where the body should be at a time () [s] of the plan."""
+    def reference(self, time: jax.Array, pace: jax.Array) -> RigidBodyState:
+        """Where the body should be at a time () [s] of the plan whose clock goes at a pace ()."""
         s, speed = self.timing.at(time)
         q, slope_B = self.path.attitude_and_slope(s)
-        return RigidBodyState(q, speed * slope_B)
+        return RigidBodyState(q, pace * speed * slope_B)
+
+    def error(self, body: RigidBodyState) -> jax.Array:
+        """Rotation vector (3,) [rad] from where the body should be to where it is."""
+        s, _ = self.timing.at(self.clock)
+        return feedback.rotation_vector(rotations.multiply(rotations.conjugate(self.path.attitude(s)), body.q_BN))
 
 
 class _Found(struct.PyTreeNode):
@@ -53,7 +63,7 @@ class _Found(struct.PyTreeNode):
 
 
 class PathPlanner(struct.PyTreeNode):
-    """Plans in ``begin``, tracks in ``decide``.
+    """Plans in ``begin``, tracks in ``decide``, and plans anew where something has led it off its path.
 
     The tracking error decays with ``bandwidth``, its rate with ``rate_bandwidth``.
     """
@@ -71,6 +81,7 @@ class PathPlanner(struct.PyTreeNode):
 
     def begin(self, state: EnvState, model: Model, key: jax.Array) -> Plan:
         """Search for a path from the state to its target."""
+        key, key_search = jax.random.split(key)
 
         def cost(bends_B: jax.Array) -> jax.Array:
             path = attitude_path.from_state(state.body, state.scenario.q_DN, bends_B)
@@ -80,10 +91,10 @@ class PathPlanner(struct.PyTreeNode):
             return timing.duration + _SECONDS_PER_SHORTFALL * jnp.maximum(self.margin - clear, 0.0)
 
         limit_B = self.torque_share * torque_limits(state, model).box_B
-        bends_B = self._search(cost, self._first_bends(state), key)
+        bends_B = self._search(cost, self._first_bends(state), key_search)
         path = attitude_path.from_state(state.body, state.scenario.q_DN, bends_B)
         samples = attitude_path.sample(path, self.points)
-        return Plan(path, attitude_path.fastest_timing(samples, model.inertia_B, limit_B), jnp.zeros(()))
+        return Plan(path, attitude_path.fastest_timing(samples, model.inertia_B, limit_B), jnp.zeros(()), key)
 
     def _search(self, cost: Callable[[jax.Array], jax.Array], first_B: jax.Array, key: jax.Array) -> jax.Array:
         """Cross-entropy search from the best of the first bends (n, sines, 3).  Returns the best found (sines, 3)."""
@@ -121,12 +132,27 @@ class PathPlanner(struct.PyTreeNode):
     def decide(self, state: EnvState, model: Model, memory: Plan) -> tuple[jax.Array, Plan]:
         """Action (3,), and the plan with its clock moved on."""
         body, dt = state.body, model.dt
-        now, soon = memory.reference(memory.clock), memory.reference(memory.clock + dt)
-        error_B = feedback.rotation_vector(rotations.multiply(rotations.conjugate(now.q_BN), body.q_BN))
+        plan = self._not_lost(state, model, memory)
+        error_B = plan.error(body)
+        pace = jnp.clip(2.0 - rotations.norm(error_B) / self.patience, 0.0, 1.0)
+        now, soon = plan.reference(plan.clock, pace), plan.reference(plan.clock + pace * dt, pace)
         wanted_B = now.omega_BN_B - self.bandwidth * error_B
         change_B = (soon.omega_BN_B - now.omega_BN_B) / dt - self.bandwidth * (body.omega_BN_B - now.omega_BN_B)
         acceleration_B = change_B + self.rate_bandwidth * (wanted_B - body.omega_BN_B)
         middle = body.replace(omega_BN_B=body.omega_BN_B + 0.5 * dt * change_B)
-        pace = jnp.clip(2.0 - rotations.norm(error_B) / self.patience, 0.0, 1.0)
         action = feedback.action(acceleration_B, middle, model.inertia_B, torque_limits(state, model))
-        return action, memory.replace(clock=memory.clock + pace * dt)
+        return action, plan.replace(clock=plan.clock + pace * dt)
+
+    def _not_lost(self, state: EnvState, model: Model, plan: Plan) -> Plan:
+        """The plan, or a new one from here where the body is too far from it."""
+
+        def is_lost(plan: Plan) -> jax.Array:
+            return rotations.norm(plan.error(state.body)) > _LOST * self.patience
+
+        def anew(lost: Plan) -> Plan:
+            # Without the barrier the search is done in advance, at every step, as it does not depend on the loop.
+            lost, here = jax.lax.optimization_barrier((lost, state))
+            return self.begin(here, model, lost.key)
+
+        # A loop, not a branch: a batch then plans only when one of it is lost.
+        return jax.lax.while_loop(is_lost, anew, plan)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-from typing import TYPE_CHECKING, NamedTuple
+import inspect
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from koz_jax.config.task import TaskConfig
 from koz_jax.errors import SettingsError
 
 if TYPE_CHECKING:
-    from koz_jax.control.base import Controller
+    from koz_jax.control.base import Controller, TaskController
 
 
 class BuiltIn(NamedTuple):
@@ -67,3 +68,41 @@ def load_controller(name: str, task: TaskConfig | None = None) -> NamedControlle
     entry = BUILT_IN[name]
     made = getattr(importlib.import_module(f"koz_jax.control.{entry.module}"), entry.class_name)
     return NamedController(name, made(), flown)
+
+
+def as_task_controller(given: TaskController | Controller, task: TaskConfig | None = None) -> TaskController:
+    """Give a bare controller a name and a task; one of somebody else's making is tried before it flies.
+
+    given: a ``TaskController``, such as an agent, or a controller; task: the one that it flies, by default its own or
+        the paper's.
+
+    Raises:
+        SettingsError: it is neither, or it cannot fly.
+
+    """
+    if isinstance(given, type):
+        raise SettingsError(
+            f"agent: must be an object, got the class {given.__name__}; give {given.__name__}()"
+        )
+    flying: Any = given
+    if not all(hasattr(given, name) for name in ("name", "task", "controller")):
+        if not hasattr(given, "decide"):
+            raise SettingsError(
+                f"agent: must be an agent (load_agent), a controller (load_controller), or an object with the methods"
+                f" begin and decide; got {type(given).__name__}"
+            )
+        flying = NamedController(type(given).__name__, cast("Controller", given), task or TaskConfig())
+    kind = type(flying.controller)
+    if kind.__module__.partition(".")[0] != "koz_jax":
+        from koz_jax.control import trial
+
+        trial.check(flying.controller, kind.__name__, _source(kind), task or flying.task)
+    return flying
+
+
+def _source(kind: type) -> str:
+    """File of a class; empty where it has none."""
+    try:
+        return inspect.getsourcefile(kind) or ""
+    except (OSError, TypeError):
+        return ""

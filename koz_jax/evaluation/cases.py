@@ -17,11 +17,13 @@ from jax.sharding import Mesh, PartitionSpec
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.task import TaskConfig, check_feasible
 from koz_jax.control.base import Controller, TaskController
-from koz_jax.control.shield import under_shield
+from koz_jax.control.registry import as_task_controller
+from koz_jax.control.shield.filter import under_shield
 from koz_jax.errors import SettingsError
-from koz_jax.evaluation import rollout
+from koz_jax.evaluation import cautions, rollout
 from koz_jax.evaluation.rollout import CaseResult, History
-from koz_jax.task import uncertainty
+from koz_jax.task import maneuver, uncertainty
+from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.environment import Reorientation
 from koz_jax.task.scenario import SamplingRule, Scenario
 
@@ -58,7 +60,7 @@ class _Flight(struct.PyTreeNode):
 
     def flight_key(self, index: jax.Array | int) -> jax.Array:
         """Key of what is random while a case is flown.  index: () int."""
-        return jax.random.fold_in(jax.random.fold_in(self.key, _IN_FLIGHT), index)
+        return _flight_key(self.key, index)
 
     def evaluate(self, drawn: Scenario, key: jax.Array) -> CaseResult:
         return rollout.run_case(self.env, self.controller, drawn, self.substeps, key)
@@ -82,6 +84,10 @@ def environment(task: TaskConfig, config: MonteCarloConfig) -> Reorientation:
 
 def _key(config: MonteCarloConfig) -> jax.Array:
     return jax.random.fold_in(jax.random.key(config.seed), _PURPOSE)
+
+
+def _flight_key(key: jax.Array, index: jax.Array | int) -> jax.Array:
+    return jax.random.fold_in(jax.random.fold_in(key, _IN_FLIGHT), index)
 
 
 def _flight(controller: Controller, task: TaskConfig, config: MonteCarloConfig) -> _Flight:
@@ -169,7 +175,7 @@ def fly_case(
 
 
 def fly_scenario(
-    agent: TaskController,
+    agent: TaskController | Controller,
     drawn: Scenario,
     task: TaskConfig | None = None,
     config: MonteCarloConfig | None = None,
@@ -177,13 +183,37 @@ def fly_scenario(
 ) -> tuple[History, CaseResult]:
     """Fly one scenario, and keep its history and its judgement.
 
-    config: how it is flown and checked; its draw is not used.  case: index of the case whose random numbers are used.
+    drawn: checked before it is flown, see ``maneuver.checked``.  config: how it is flown and checked; its draw is not
+    used.  case: index of the case whose random numbers are used.
+
+    Raises:
+        SettingsError: the scenario holds a direction, a quaternion, a rate or an angle that is none, or the
+            controller cannot fly.
+
     """
-    how = config or MonteCarloConfig()
-    flight = _flight(agent.controller, task or agent.task, how)
-    return _keep_and_evaluate(flight, drawn, flight.flight_key(case))
+    flying = as_task_controller(agent, task)
+    how, flown = config or MonteCarloConfig(), task or flying.task
+    right = maneuver.checked(drawn)
+    maneuver.tell_of_another_boresight(right, flown.spacecraft.boresight)
+    cautions.warn_of_differences(flying, flown)
+    cautions.warn_of_target(flying, right, how.shield)
+    flight = _flight(flying.controller, flown, how)
+    return _keep_and_evaluate(flight, right, flight.flight_key(case))
 
 
 @jax.jit
 def _keep_and_evaluate(flight: _Flight, drawn: Scenario, key: jax.Array) -> tuple[History, CaseResult]:
     return rollout.fly(flight.env, flight.controller, drawn, key), flight.evaluate(drawn, key)
+
+
+def within_steps(history: History, task: TaskConfig, config: MonteCarloConfig, case: int = 0) -> RigidBodyState:
+    """Where the body was also between the steps of what ``fly_scenario`` flew with the same arguments.
+
+    Returns leaves (steps * substeps + 1, ...), with the settings' ``substeps``.
+    """
+    return _within_steps(environment(task, config), history, _flight_key(_key(config), case), config.substeps)
+
+
+@functools.partial(jax.jit, static_argnames="substeps")
+def _within_steps(env: Reorientation, history: History, key: jax.Array, substeps: int) -> RigidBodyState:
+    return rollout.within_steps(env, history, substeps, key)

@@ -22,10 +22,11 @@ from tqdm import tqdm
 
 from koz_jax.config.base import checked
 from koz_jax.config.monte_carlo import MonteCarloConfig
-from koz_jax.config.task import TaskConfig, check_feasible
-from koz_jax.control.base import TaskController
+from koz_jax.config.task import TaskConfig, check_feasible, is_paper_task
+from koz_jax.control.base import Controller, TaskController
+from koz_jax.control.registry import as_task_controller
 from koz_jax.errors import SettingsError, StorageError
-from koz_jax.evaluation import cases
+from koz_jax.evaluation import cases, cautions
 from koz_jax.evaluation.cases import Flown
 from koz_jax.evaluation.rollout import CaseResult
 from koz_jax.evaluation.summary import Summary
@@ -42,14 +43,25 @@ class MonteCarlo:
     """The outcome of every case, and what it took."""
 
     agent: str  # name of the agent, or the folder it came from
+    task: TaskConfig  # that was flown
     config: MonteCarloConfig
     results: CaseResult  # NumPy leaves (cases,)
     compile_s: float  # [s] tracing and compiling
     wall_s: float  # [s] flying
 
+    @property
+    def label(self) -> str:
+        """Who flew, for tables and titles."""
+        return self.agent if self.config.shield is None else f"{self.agent} + shield"
+
+    @property
+    def is_of_paper(self) -> bool:
+        """Whether the paper's numbers are of the same task."""
+        return self.config.is_papers_draw and is_paper_task(self.task)
+
 
 def monte_carlo(
-    agent: TaskController,
+    agent: TaskController | Controller,
     cases: int = 10_000,
     seed: int = 0,
     task: TaskConfig | None = None,
@@ -61,7 +73,7 @@ def monte_carlo(
     """Fly an agent over ``cases`` random cases of the task it was trained for (or of another one).
 
     Args:
-        agent: who flies.
+        agent: who flies; a controller without a task flies the paper's.
         cases: number of cases.
         seed: seed of the draw; case i of a seed is always the same.
         task: what is flown; by default what the agent was made for.
@@ -70,11 +82,12 @@ def monte_carlo(
         options: further fields of ``MonteCarloConfig``.
 
     Raises:
-        SettingsError: an option is not allowed.
+        SettingsError: an option is not allowed, or the controller cannot fly.
 
     """
     config = checked(MonteCarloConfig, cases=cases, seed=seed, **options)
-    return run_cases(agent, task or agent.task, config, partial=partial, progress=progress)
+    flying = as_task_controller(agent, task)
+    return run_cases(flying, task or flying.task, config, partial=partial, progress=progress)
 
 
 def report(flown: MonteCarlo, summary: Summary) -> dict[str, float | int | str | None]:
@@ -115,6 +128,7 @@ def run_cases(
 
     """
     check_feasible(task, config.max_angle_deg)
+    cautions.warn_of_task(agent, task, config)
     count = jax.process_count()
     if count > 1 and partial is None:
         raise SettingsError(f"partial: {count} processes need a folder that all of them see, got none")
@@ -136,7 +150,7 @@ def run_cases(
             wall_s = time.perf_counter() - start - compile_s  # of the slowest
             flown = list(_fly(agent, task, parts, partial, identity))  # all are there to be read
     results = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(done.results for done in flown))
-    return MonteCarlo(agent.name, config, results, compile_s, wall_s)
+    return MonteCarlo(agent.name, task, config, results, compile_s, wall_s)
 
 
 def _open(partial: Path, stack: ExitStack) -> None:

@@ -6,6 +6,7 @@ from flax import struct
 
 from koz_jax.control.base import Controller, Memory
 from koz_jax.task import reward
+from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.environment import Reorientation, Step
 from koz_jax.task.reward import RewardTerms
 from koz_jax.task.scenario import Scenario
@@ -26,6 +27,7 @@ class CaseResult(struct.PyTreeNode):
     intervention_rate: jax.Array  # () share of the steps in which the shield changed the torque
     mean_torque_change: jax.Array  # () [N m] mean norm of that change over all steps
     deadlocked: jax.Array  # () bool, not settled and the shield changed the torque in the last step
+    unsafe_start: jax.Array  # () bool, in a zone at the start, or in a state from which the shield promises nothing
 
     @property
     def reward(self) -> jax.Array:
@@ -69,10 +71,16 @@ class _Tally(struct.PyTreeNode):
 
 
 def _take_off(env: Reorientation, controller: Controller, drawn: Scenario, key: jax.Array) -> _Flight:
-    key_controller, key_truth, key_noise = jax.random.split(key, 3)
+    key_controller, key_truth, key_noise = _split(key)
     state = env.reset(drawn)
     memory = controller.begin(state, env.model, key_controller)
     return _Flight(state, memory, env.sample_truth(key_truth), key_noise)
+
+
+def _split(key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Keys of what is random in the controller, in the truth, and in what is measured."""
+    key_controller, key_truth, key_noise = jax.random.split(key, 3)
+    return key_controller, key_truth, key_noise
 
 
 def _step(env: Reorientation, controller: Controller, flight: _Flight) -> tuple[_Flight, Step]:
@@ -144,7 +152,8 @@ def run_case(
         ), None
 
     end, _ = jax.lax.scan(advance, _first_tally(env, start), None, length=env.episode_steps)
-    settled = end.last_unsettled < env.episode_steps
+    # What is not finite is never a success: a comparison with nan is false.
+    settled = (end.last_unsettled < env.episode_steps) & jnp.isfinite(end.min_margin)
     return CaseResult(
         initial_angle=start.state.angle,
         reward_terms=end.reward_terms,
@@ -153,10 +162,11 @@ def run_case(
         control_accuracy=reward.pointing_error(end.flight.state.angle, env.reward),
         min_margin=end.min_margin,
         settled=settled,
-        violated=end.min_margin <= 0.0,
+        violated=~(end.min_margin > 0.0),
         intervention_rate=end.interventions / env.episode_steps,
         mean_torque_change=end.torque_change / env.episode_steps,
         deadlocked=~settled & end.intervened,
+        unsafe_start=~(env.covers(start.state) & (env.margin(start.state) > 0.0)),
     )
 
 
@@ -177,4 +187,23 @@ def fly(env: Reorientation, controller: Controller, drawn: Scenario, key: jax.Ar
         torque_B=applied_B,
         zone_margin=jax.vmap(env.margin)(states),
         pointing_error=reward.pointing_error(states.angle, env.reward),
+    )
+
+
+def within_steps(env: Reorientation, history: History, substeps: int, key: jax.Array | None = None) -> RigidBodyState:
+    """Where the body was also between the steps of a maneuver that ``fly`` flew with the same key.
+
+    substeps: instants of each step, its start among them.  Returns leaves (steps * substeps + 1, ...).
+    """
+    truth = env.sample_truth(_split(jax.random.key(0) if key is None else key)[1])
+    bodies = history.state.body
+
+    def of_a_step(body: RigidBodyState, torque_B: jax.Array) -> RigidBodyState:
+        seconds = env.model.dt * jnp.arange(substeps) / substeps
+        return jax.vmap(propagate, in_axes=(None, None, None, 0))(body, torque_B, truth, seconds)
+
+    before = jax.tree.map(lambda leaf: leaf[:-1], bodies)
+    inside = jax.vmap(of_a_step)(before, history.torque_B[:-1])
+    return jax.tree.map(
+        lambda rows, whole: jnp.concatenate([rows.reshape(-1, *rows.shape[2:]), whole[-1:]]), inside, bodies
     )

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from koz_jax.evaluation.digits import percent, percent_between, significant
+
 if TYPE_CHECKING:
+    from koz_jax.config.monte_carlo import MonteCarloConfig
     from koz_jax.evaluation.rollout import CaseResult
 
 
@@ -36,6 +39,31 @@ class Summary:
     intervention_rate: float = 0.0
     mean_torque_change: float = 0.0
     deadlock_rate: float = 0.0
+    unsafe_start_rate: float = 0.0
+
+
+class Evaluated(Protocol):
+    """What a table can be made of: a ``MonteCarlo``."""
+
+    @property
+    def config(self) -> MonteCarloConfig:
+        """Which cases were flown, and how."""
+        ...
+
+    @property
+    def results(self) -> CaseResult:
+        """The outcome of every case; NumPy leaves (cases,)."""
+        ...
+
+    @property
+    def label(self) -> str:
+        """Who flew, and whether under the shield."""
+        ...
+
+    @property
+    def is_of_paper(self) -> bool:
+        """Whether the paper's numbers are of the same task."""
+        ...
 
 
 PAPER_TABLE = Summary(
@@ -81,6 +109,7 @@ def summarise(results: CaseResult) -> Summary:
         intervention_rate=float(np.mean(results.intervention_rate)),
         mean_torque_change=float(np.mean(results.mean_torque_change)),
         deadlock_rate=float(np.mean(results.deadlocked)),
+        unsafe_start_rate=float(np.mean(results.unsafe_start)),
     )
 
 
@@ -92,46 +121,68 @@ def wilson_interval(rate: float, cases: int) -> tuple[float, float]:
     return max(0.0, centre - half_width), min(1.0, centre + half_width)
 
 
-def table(summary: Summary, cases: int, name: str, shielded: bool = False) -> str:
-    """The paper's table with ours beside it, as text; with what the shield did where there was one."""
-    ours, paper = summary, PAPER_TABLE
+def table(
+    flown: Summary | Evaluated, cases: int = 0, name: str = "", shielded: bool | None = None, paper: bool = True
+) -> str:
+    """The paper's table with ours beside it, as text.
 
-    def spread(label: str, field: str, digits: int) -> tuple[str, str, str]:
-        mean, std = {
-            "reward": ("mean_reward", "std_reward"),
-        }.get(field, (f"{field}_mean", f"{field}_std"))
+    Args:
+        flown: a whole Monte Carlo, which knows all of the following itself; or its summary alone.
+        cases: number of cases.
+        name: of who flew, by default the agent's.
+        shielded: whether a shield flew, for the rows on what it did; by default where it did anything.
+        paper: whether the task is the paper's, so that its numbers stand beside ours.
+    """
+    if isinstance(flown, Summary):
+        did_something = bool(flown.intervention_rate or flown.deadlock_rate or flown.unsafe_start_rate)
+        return _lines(flown, cases, name, did_something if shielded is None else shielded, paper)
+    with_shield = flown.config.shield is not None
+    return _lines(summarise(flown.results), flown.config.cases, name or flown.label, with_shield, flown.is_of_paper)
+
+
+def _lines(ours: Summary, cases: int, name: str, shielded: bool, paper: bool) -> str:
+    """Rows of a label, the paper's number and ours, aligned."""
+    rows = [(f"{cases} cases", "paper", name), *_rows(ours, cases)]
+    if shielded:
+        rows += [
+            ("shield intervened, of all steps", "-", percent(ours.intervention_rate)),
+            ("mean change of torque [N m]", "-", significant(ours.mean_torque_change, 4)),
+            ("deadlocked", "-", percent(ours.deadlock_rate)),
+            ("start not covered by the shield", "-", percent(ours.unsafe_start_rate)),
+        ]
+    columns = (0, 1, 2) if paper else (0, 2)
+    widths = [max(len(row[column]) for row in rows) for column in columns]
+    lines = [
+        "  ".join(row[column].ljust(width) for column, width in zip(columns, widths, strict=True)).rstrip()
+        for row in rows
+    ]
+    lines.insert(1, "-" * max(map(len, lines)))
+    return "\n".join([*lines, "* settled cases only; rates with their 95 % interval"])
+
+
+def _rows(ours: Summary, cases: int) -> list[tuple[str, str, str]]:
+    paper = PAPER_TABLE
+
+    def spread(label: str, mean: str, std: str, decimals: int) -> tuple[str, str, str]:
+        papers, own = ((getattr(summary, mean), getattr(summary, std)) for summary in (paper, ours))
         return (
             label,
-            f"{getattr(paper, mean):.{min(digits, 2)}f} +- {getattr(paper, std):.{min(digits, 2)}f}",
-            f"{getattr(ours, mean):.{digits}f} +- {getattr(ours, std):.{digits}f}",
+            " +- ".join(f"{value:.2f}" for value in papers),
+            " +- ".join(significant(value, decimals) for value in own),
         )
 
-    def rate(label: str, field: str, digits: int = 2) -> tuple[str, str, str]:
-        low, high = wilson_interval(getattr(ours, field), cases)
-        return (
-            label,
-            f"{100 * getattr(paper, field):.{digits}f} %",
-            f"{100 * getattr(ours, field):.2f} %  [{100 * low:.2f}, {100 * high:.2f}]",
-        )
+    def rate(label: str, field: str, decimals: int = 2) -> tuple[str, str, str]:
+        own = getattr(ours, field)
+        papers = f"{100 * getattr(paper, field):.{decimals}f} %"
+        return label, papers, percent_between(own, *wilson_interval(own, cases))
 
-    rows = [
-        (f"{cases} cases", "paper", name),
-        spread("mean reward", "reward", 2),
-        spread("settling time* [s]", "settling_time", 2),
-        spread("control effort* [N2 m2 s]", "control_effort", 2),
-        spread("control accuracy* [deg]", "control_accuracy_deg", 4),
+    return [
+        spread("mean reward", "mean_reward", "std_reward", 2),
+        spread("settling time* [s]", "settling_time_mean", "settling_time_std", 2),
+        spread("control effort* [N2 m2 s]", "control_effort_mean", "control_effort_std", 2),
+        spread("control accuracy* [deg]", "control_accuracy_deg_mean", "control_accuracy_deg_std", 4),
         rate("not settled", "non_settled_rate"),
         rate("violated", "violation_rate"),
         rate("success", "success_rate", 0),
-        ("smallest margin [deg]", "-", f"{ours.min_margin_deg:.3f}"),
+        ("smallest margin [deg]", "-", significant(ours.min_margin_deg, 3)),
     ]
-    if shielded:
-        rows += [
-            ("shield intervened, of all steps", "-", f"{100 * ours.intervention_rate:.2f} %"),
-            ("mean change of torque [N m]", "-", f"{ours.mean_torque_change:.4f}"),
-            ("deadlocked", "-", f"{100 * ours.deadlock_rate:.2f} %"),
-        ]
-    widths = [max(len(row[column]) for row in rows) for column in range(3)]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    lines.insert(1, "-" * max(map(len, lines)))
-    return "\n".join([*lines, "* settled cases only; rates with their 95 % interval"])

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from koz_jax.config.task import TaskConfig
+from koz_jax.evaluation.digits import significant
 from koz_jax.evaluation.rollout import CaseResult, History
 
 
@@ -37,6 +38,7 @@ def cases_csv(results: CaseResult) -> str:
             "intervention_rate": np.asarray(results.intervention_rate),
             "mean_torque_change_Nm": np.asarray(results.mean_torque_change),
             "deadlocked": np.asarray(results.deadlocked),
+            "unsafe_start": np.asarray(results.unsafe_start),
             "settled": np.asarray(results.settled),
             "violated": np.asarray(results.violated),
         }
@@ -66,11 +68,13 @@ def describe_case(case: int, result: CaseResult) -> str:
 
 def describe_result(result: CaseResult) -> str:
     """What a maneuver comes to, in one line."""
-    settled = f"settled after {float(result.settling_time):.1f} s" if result.settled else "not settled"
+    settled = f"settled after {significant(float(result.settling_time), 1)} s" if result.settled else "not settled"
     zone = "violated the zone" if result.violated else "stayed clear of the zone"
+    start = ", from a start that the shield does not cover" if result.unsafe_start else ""
     return (
-        f"{np.rad2deg(float(result.initial_angle)):.1f} deg, {settled}, {zone}"
-        f" (smallest margin {np.rad2deg(float(result.min_margin)):.2f} deg),"
-        f" effort {float(result.control_effort):.1f} N2 m2 s,"
-        f" accuracy {np.rad2deg(float(result.control_accuracy)):.4f} deg, reward {float(result.reward):.1f}"
+        f"{significant(np.rad2deg(float(result.initial_angle)), 1)} deg{start}, {settled}, {zone}"
+        f" (smallest margin {significant(np.rad2deg(float(result.min_margin)), 2)} deg),"
+        f" effort {significant(float(result.control_effort), 1)} N2 m2 s,"
+        f" accuracy {significant(np.rad2deg(float(result.control_accuracy)), 4)} deg,"
+        f" reward {significant(float(result.reward), 1)}"
     )

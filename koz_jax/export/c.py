@@ -3,18 +3,24 @@
 import importlib.resources
 from collections.abc import Iterable
 
+import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from koz_jax.agents.numpy_policy import NumpyPolicy, exported_zone_count
 from koz_jax.config.base import Vector
 from koz_jax.config.shield import ShieldConfig
-from koz_jax.control import shield
-from koz_jax.export.golden import Golden, ShieldGolden
+from koz_jax.config.task import TaskConfig
+from koz_jax.control.shield import brake_path, guide
+from koz_jax.control.shield import filter as shield
+from koz_jax.export.golden import EXAMPLE_CASE, Golden
 from koz_jax.export.metadata import Metadata, as_text, describe
-from koz_jax.task import dynamics, environment
+from koz_jax.export.shield_golden import ShieldGolden
+from koz_jax.task import dynamics, environment, pointing_constraints
 from koz_jax.task.observation_layout import ACTION_SIZE, size
+from koz_jax.task.state import Model
 
-C_FILES = ("koz_math.h", "koz_policy.h", "koz_policy.c", "koz_selftest.c", "Makefile")
+C_FILES = ("koz_math.h", "koz_policy.h", "koz_policy.c", "koz_selftest.c", "koz_example.c", "Makefile")
 SHIELD_FILES = ("koz_shield.h", "koz_shield.c", "koz_shield_selftest.c")
 
 # 1e-5 of the action's range, which is 2.
@@ -22,9 +28,14 @@ _ACTION_TOLERANCE = "2e-5"
 _OBSERVATION_TOLERANCE = "2e-5"
 _TORQUE_TOLERANCE = "1e-3"
 
+_EXAMPLE_ROWS = 20
 
-def c_files(policy: NumpyPolicy, vectors: Golden) -> dict[str, bytes]:
-    """Headers, source, self-test with golden vectors, and Makefile, by file name."""
+
+def c_files(policy: NumpyPolicy, vectors: Golden, example: np.ndarray) -> dict[str, bytes]:
+    """Headers, source, self-test with golden vectors, example, and Makefile, by file name.
+
+    example: (11 + 4 zones,) the situation in which the example's maneuver starts.
+    """
     metadata = describe(policy)
     network = metadata.network
     replacements = {
@@ -47,6 +58,9 @@ def c_files(policy: NumpyPolicy, vectors: Golden) -> dict[str, bytes]:
         "ACTION_TOLERANCE": _ACTION_TOLERANCE,
         "OBSERVATION_TOLERANCE": _OBSERVATION_TOLERANCE,
         "SITUATIONS": _situations(vectors.situation, policy),
+        "MEMORIES": ",\n".join(f"    {{{_braced(q_e)}}}" for q_e in vectors.memory),
+        "SITUATION": _situations(example[None], policy).strip(),
+        **_example(metadata.task),
         "OBSERVATIONS": _rows(vectors.observation),
         "ACTIONS": _rows(vectors.action),
     }
@@ -58,38 +72,68 @@ def shield_files(policy: NumpyPolicy, config: ShieldConfig, vectors: ShieldGolde
     metadata = describe(policy)
     model = environment.model_from_config(metadata.task)
     made = shield.from_config(config, model)
-    matrices = {
-        "INERTIA": model.inertia_B,
-        "INVERSE_INERTIA": dynamics.inverse(model.inertia_B),
-    }
-    numbers = {
-        "MARGIN": made.margin,
-        "BRAKE_TORQUE": made.brake_torque,
-        "ARC_ERROR": made.arc_error,
-        "RATE_ERROR": made.rate_error,
-        "GUIDE_RATE": made.guide_rate,
-        "SMALLEST_MOMENT": made.smallest_moment,
-        "LARGEST_MOMENT": made.largest_moment,
-        "GUIDE_SECONDS": shield.GUIDE_SECONDS,
-    }
     replacements = {
         "HEAD": _head(metadata),
         "EXPORT_ID": _export_id(metadata),
         "MARGIN_DEG": f"{np.rad2deg(made.margin):.4g}",
-        "GUIDE_RATE_DEG": f"{config.guide_rate_deg:g}",
-        **{name.upper(): f"{error:g}" for name, error in config.error_bounds.model_dump().items()},
+        "GUIDE_RATE_DEG": f"{np.rad2deg(made.guide.rate):.4g}",
+        **{f"STATED_{name.upper()}": f"{error:g}" for name, error in config.error_bounds.model_dump().items()},
         **_limits(metadata.torque_limit),
-        "SAMPLES": str(made.samples),
+        "SAMPLES": str(made.brake.samples),
         "COUNT": str(len(vectors.allowed)),
         "TOLERANCE": _TORQUE_TOLERANCE,
         "SITUATIONS": _situations(vectors.situation, policy),
         "REQUESTED": _rows(vectors.requested),
         "ALLOWED": _rows(vectors.allowed),
         "SAFE": ", ".join(str(int(safe)) for safe in vectors.safe),
-        **{name: ", ".join(_braced(row) for row in np.asarray(matrix)) for name, matrix in matrices.items()},
-        **{name: _number(float(value)) for name, value in numbers.items()},
+        **_shield_constants(made, model, metadata),
     }
     return {name: _fill(name, replacements).encode() for name in SHIELD_FILES}
+
+
+def _shield_constants(made: shield.Shield, model: Model, metadata: Metadata) -> dict[str, str]:
+    """What the source of a shield holds, by placeholder."""
+    brake, boresight_B = made.brake, jnp.array(metadata.boresight_B)
+    numbers = {
+        "MARGIN": made.margin,
+        "ATTITUDE_ERROR": made.attitude_error,
+        "BRAKE_TORQUE": brake.torque,
+        "INERTIA_ERROR": brake.inertia_error,
+        "DISTURBANCE": brake.disturbance,
+        "RATE_ERROR": brake.rate_error,
+        "SMALLEST_MOMENT": brake.smallest_moment,
+        "LARGEST_MOMENT": brake.largest_moment,
+        "SPEED_PER_MOMENTUM": brake_path.situation(pointing_constraints.absent(1, boresight_B), model).speed[0],
+        "GUIDE_RATE": made.guide.rate,
+        "GUIDE_SECONDS": made.guide.seconds,
+        "GUIDE_TILT": made.guide.tilt,
+        "GUIDE_AHEAD": guide.AHEAD,
+        "SLOW_STEPS": shield.SLOW_STEPS,
+        "RAISE": shield.RAISE,
+    }
+    shares = {"REQUEST_SHARES": shield.REQUEST_SHARES, "GUIDE_SHARES": shield.GUIDE_SHARES}
+    return {
+        "INERTIA": _matrix(model.inertia_B),
+        "INVERSE_INERTIA": _matrix(dynamics.inverse(model.inertia_B)),
+        **{f"{name}_COUNT": str(len(values)) for name, values in shares.items()},
+        **{name: _row(values) for name, values in shares.items()},
+        **{name: _number(float(value)) for name, value in numbers.items()},
+    }
+
+
+def _example(task: TaskConfig) -> dict[str, str]:
+    """The rigid body of the example, in double precision, and how long it flies."""
+    inertia = np.array(task.spacecraft.inertia)
+    settled_deg = task.reward.settled_angle_deg / (1.0 if task.angle_convention == "full" else 0.5)
+    exact = {"INERTIA": inertia, "INVERSE_INERTIA": np.linalg.inv(inertia)}
+    return {
+        "EXAMPLE": f"case {EXAMPLE_CASE} of koz evaluate",
+        "STEPS": str(task.episode_steps),
+        "ROW_STEPS": str(max(1, task.episode_steps // _EXAMPLE_ROWS)),
+        "SETTLED_DEG": repr(float(settled_deg)),
+        "EXACT_BORESIGHT": _exact_row(task.spacecraft.boresight),
+        **{f"EXACT_{name}": ", ".join(f"{{{_exact_row(row)}}}" for row in rows) for name, rows in exact.items()},
+    }
 
 
 def _limits(limit: float | Vector) -> dict[str, str]:
@@ -140,8 +184,16 @@ def _row(values: Iterable[float]) -> str:
     return ", ".join(_number(value) for value in values)
 
 
+def _exact_row(values: Iterable[float]) -> str:
+    return ", ".join(repr(float(value)) for value in values)
+
+
 def _rows(table: np.ndarray) -> str:
     return ",\n".join(f"    {_braced(row)}" for row in table)
+
+
+def _matrix(rows: ArrayLike) -> str:
+    return ", ".join(_braced(row) for row in np.asarray(rows))
 
 
 def _situations(rows: np.ndarray, policy: NumpyPolicy) -> str:
@@ -150,10 +202,10 @@ def _situations(rows: np.ndarray, policy: NumpyPolicy) -> str:
 
 
 def _situation(row: np.ndarray, zones: int) -> str:
-    q_BN, omega, q_DN, axes, half_angles, before = np.split(row, np.cumsum([4, 3, 4, 3 * zones, zones]))
+    q_BN, omega, q_DN, axes, half_angles = np.split(row, np.cumsum([4, 3, 4, 3 * zones]))
     attitude = ", ".join(_braced(part) for part in (q_BN, omega, q_DN))
     axis_rows = ", ".join(_braced(axis) for axis in axes.reshape(zones, 3))
-    return f"    {{{attitude}, {{{axis_rows}}}, {_braced(half_angles)}, {_row(before)}}}"
+    return f"    {{{attitude}, {{{axis_rows}}}, {_braced(half_angles)}}}"
 
 
 def _braced(values: Iterable[float]) -> str:

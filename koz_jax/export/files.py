@@ -8,7 +8,8 @@ from koz_jax.agents.agent import Agent
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.errors import SettingsError
 from koz_jax.export.c import C_FILES, SHIELD_FILES, c_files, shield_files
-from koz_jax.export.golden import golden, shield_golden
+from koz_jax.export.golden import example, golden
+from koz_jax.export.shield_golden import shield_golden
 from koz_jax.storage import files
 
 GOLDEN_VECTORS = 100
@@ -33,7 +34,7 @@ def export(agent: Agent, to: Literal["c", "onnx", "stablehlo"], shield: ShieldCo
         from koz_jax.export.stablehlo import stablehlo_files
 
         return stablehlo_files(agent)
-    contents = c_files(agent.to_numpy(), golden(agent, GOLDEN_VECTORS))
+    contents = c_files(agent.to_numpy(), golden(agent, GOLDEN_VECTORS), example(agent))
     if shield is None:
         return contents
     return contents | shield_files(agent.to_numpy(), shield, shield_golden(agent, shield, GOLDEN_VECTORS))

@@ -11,6 +11,8 @@ import numpy as np
 from koz_jax.errors import SettingsError
 from koz_jax.task.observation_layout import ACTION_SIZE
 
+_MEMORY_SIZE = 4  # of ``koz_memory``
+
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 
 
@@ -44,25 +46,49 @@ class CLibrary:
         self.zones, self._observation_size = (
             int(re.findall(rf"#define {name} (\d+)", header)[0]) for name in ("KOZ_ZONES", "KOZ_OBSERVATION_SIZE")
         )
-        for name in ("koz_observe", "koz_decide", "koz_torque"):
-            getattr(self._functions, name).argtypes = (ctypes.c_void_p, ctypes.c_void_p)
-            getattr(self._functions, name).restype = None
+        self._situation_size = 11 + 4 * self.zones
+        for name, pointers in (("start", 2), ("observe", 3), ("decide", 2), ("torque", 2)):
+            getattr(self._functions, f"koz_{name}").argtypes = (ctypes.c_void_p,) * pointers
+            getattr(self._functions, f"koz_{name}").restype = None
+        self._functions.koz_fault.argtypes = (ctypes.c_void_p,)
+        self._functions.koz_fault.restype = ctypes.c_char_p
         self.has_shield = shield.is_file()
         if self.has_shield:
             self._functions.koz_shield.argtypes = (ctypes.c_void_p,) * 3
             self._functions.koz_shield.restype = None
 
-    def observe(self, situations: np.ndarray) -> np.ndarray:
-        """Observations (batch, entries) of situations (batch, 12 + 4 zones): ``koz_situation`` field by field."""
-        return self._rows("koz_observe", situations, 12 + 4 * self.zones, self._observation_size)
+    def faults(self, situations: np.ndarray) -> list[str | None]:
+        """What is wrong with each situation (batch, 11 + 4 zones): ``koz_situation`` field by field; None: nothing."""
+        told = _rows_of("situations", situations, self._situation_size)
+        found = [self._functions.koz_fault(row.ctypes.data) for row in told]
+        return [None if fault is None else fault.decode() for fault in found]
+
+    def start(self, situations: np.ndarray) -> np.ndarray:
+        """Begin maneuvers in these situations (batch, 11 + 4 zones).  Returns memories (batch, 4) for ``observe``."""
+        told = _rows_of("situations", situations, self._situation_size)
+        memories = np.empty((len(told), _MEMORY_SIZE), np.float32)
+        self._each("koz_start", memories, told)
+        return memories
+
+    def observe(self, situations: np.ndarray, memories: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Observations (batch, entries) of situations (batch, 11 + 4 zones), and the memories (batch, 4) from then on.
+
+        situations: ``koz_situation`` field by field; memories: of ``start``, or of the step before.
+        """
+        told = _rows_of("situations", situations, self._situation_size)
+        kept = _rows_of("memories", memories, _MEMORY_SIZE).copy()
+        _check_as_many("memories", kept, told)
+        observations = np.empty((len(told), self._observation_size), np.float32)
+        self._each("koz_observe", kept, told, observations)
+        return observations, kept
 
     def decide(self, observations: np.ndarray) -> np.ndarray:
         """Actions (batch, 3) in [-1, 1] for observations (batch, entries)."""
-        return self._rows("koz_decide", observations, self._observation_size, ACTION_SIZE)
+        return self._answer("koz_decide", observations)
 
     def torque(self, observations: np.ndarray) -> np.ndarray:
         """Torques (batch, 3) [N m] in body axes for observations (batch, entries)."""
-        return self._rows("koz_torque", observations, self._observation_size, ACTION_SIZE)
+        return self._answer("koz_torque", observations)
 
     def shield(self, situations: np.ndarray, torques: np.ndarray) -> np.ndarray:
         """Torques (batch, 3) [N m] that the shield allows in place of the requested ones.
@@ -73,24 +99,26 @@ class CLibrary:
         """
         if not self.has_shield:
             raise SettingsError("shield: this controller was exported without; --shield exports it")
-        told = _rows_of("situations", situations, 12 + 4 * self.zones)
+        told = _rows_of("situations", situations, self._situation_size)
         requested = _rows_of("torques", torques, ACTION_SIZE)
-        if len(told) != len(requested):
-            raise SettingsError(f"torques: must be one for each of {len(told)} situations, got {len(requested)}")
+        _check_as_many("torques", requested, told)
         allowed = np.empty_like(requested)
-        for row, torque, into in zip(told, requested, allowed, strict=True):
-            self._functions.koz_shield(row.ctypes.data, torque.ctypes.data, into.ctypes.data)
+        self._each("koz_shield", told, requested, allowed)
         return allowed
 
-    def _rows(self, name: str, inputs: np.ndarray, entries: int, size: int) -> np.ndarray:
+    def _answer(self, name: str, observations: np.ndarray) -> np.ndarray:
+        asked = _rows_of("observations", observations, self._observation_size)
+        answers = np.empty((len(asked), ACTION_SIZE), np.float32)
+        self._each(name, asked, answers)
+        return answers
+
+    def _each(self, name: str, *tables: np.ndarray) -> None:
+        """Call a function for each row of some tables."""
         function = getattr(self._functions, name)
-        rows = _rows_of(name, inputs, entries)
-        outputs = np.empty((len(rows), size), np.float32)
         # Addresses of rows, because making a view of each would take longer than the controller does.
-        source, target = rows.ctypes.data, outputs.ctypes.data
-        for index in range(len(rows)):
-            function(source + index * rows.strides[0], target + index * outputs.strides[0])
-        return outputs
+        places = [(table.ctypes.data, table.strides[0]) for table in tables]
+        for index in range(len(tables[0])):
+            function(*(start + index * stride for start, stride in places))
 
 
 def _rows_of(name: str, given: np.ndarray, entries: int) -> np.ndarray:
@@ -99,3 +127,8 @@ def _rows_of(name: str, given: np.ndarray, entries: int) -> np.ndarray:
     if rows.ndim != 2 or rows.shape[1] != entries:
         raise SettingsError(f"{name}: must have shape (batch, {entries}), got {rows.shape}")
     return rows
+
+
+def _check_as_many(name: str, given: np.ndarray, situations: np.ndarray) -> None:
+    if len(given) != len(situations):
+        raise SettingsError(f"{name}: must be one for each of {len(situations)} situations, got {len(given)}")

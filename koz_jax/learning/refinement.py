@@ -15,7 +15,7 @@ from flax import struct
 
 from koz_jax.config.training import RefineConfig, TrainConfig
 from koz_jax.control.policy import PolicyController
-from koz_jax.control.shield import under_shield
+from koz_jax.control.shield.filter import under_shield
 from koz_jax.learning.train_step import MAX_DRAWS
 from koz_jax.sac.networks import Params
 from koz_jax.task.environment import Reorientation

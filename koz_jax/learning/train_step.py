@@ -8,7 +8,7 @@ from flax import struct
 
 from koz_jax.config.training import TrainConfig
 from koz_jax.control import encoding
-from koz_jax.control.shield import under_shield
+from koz_jax.control.shield.filter import under_shield
 from koz_jax.learning import curriculum, finite_checks
 from koz_jax.learning.curriculum import Difficulty
 from koz_jax.sac import learner as sac_learner

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from koz_jax.config.task import TaskConfig, check_deviations, check_feasible
-from koz_jax.task import observation, pointing_constraints, reward, rotations, scenario, state
+from koz_jax.task import maneuver, observation, pointing_constraints, reward, rotations, scenario, state
 from koz_jax.task import uncertainty as errors
 from koz_jax.task.actuators import TorqueBox, TorqueLimits
 from koz_jax.task.reward import Outcome, RewardParams, RewardTerms
@@ -28,8 +28,8 @@ from koz_jax.task.uncertainty import Uncertainty
 class ActionFilter(Protocol):
     """What stands between a controller and the actuators, such as the shield.  Implementations are pytrees."""
 
-    def start(self, drawn: Scenario, model: Model) -> Scenario:
-        """Make of a scenario one that can be flown under the filter."""
+    def covers(self, at: EnvState, model: Model) -> jax.Array:
+        """Whether what the filter guarantees holds from this state on.  Returns () bool."""
         ...
 
     def allow(self, measured: EnvState, action: jax.Array, model: Model) -> jax.Array:
@@ -127,15 +127,20 @@ class Reorientation(struct.PyTreeNode):
         return self.model.actuators.limits(self.model.actuators.initial_state())
 
     def sample(self, key: jax.Array) -> Scenario:
-        """Draw a scenario, as it is drawn; ``reset`` may make it one that can be flown.  key: () typed PRNG key."""
+        """Draw a scenario.  key: () typed PRNG key."""
         return scenario.sample(key, self.ranges, self.rule)
 
     def reset(self, start: jax.Array | Scenario) -> EnvState:
-        """Begin a maneuver: a given scenario, or one drawn with a typed PRNG key ()."""
-        drawn = start if isinstance(start, Scenario) else self.sample(start)
-        if self.action_filter is not None:
-            drawn = self.action_filter.start(drawn, self.model)
+        """Begin a maneuver: a given scenario, or one drawn with a typed PRNG key ().
+
+        A scenario is checked, see ``maneuver.checked``, where it is not being traced.
+        """
+        drawn = maneuver.checked(start) if isinstance(start, Scenario) else self.sample(start)
         return state.begin(drawn, self.model)
+
+    def covers(self, at: EnvState) -> jax.Array:
+        """Whether what the filter guarantees holds from this state on; also where there is none.  Returns () bool."""
+        return jnp.array(True) if self.action_filter is None else self.action_filter.covers(at, self.model)
 
     def observe(self, measured: EnvState) -> jax.Array:
         """What a controller sees of a state.  Returns (16,), 5 more for each observed zone above one."""

@@ -28,13 +28,14 @@ _ZONE = {
 
 # For those who only get an exported controller.
 _MEANING = {
-    "q_e": "attitude error q_DN* (x) q_BN, scalar first; continuous in time, q_e0 >= 0 at the start",
+    "q_e": "attitude error q_DN* (x) q_BN, scalar first; of it and its negative, which are one attitude, the one nearer"
+    " to that of the step before, at the start the one with q_e0 >= 0: the sign of a measured q_BN may jump",
     "omega_BN_B": "[rad/s] rate of the body relative to inertial, in body axes",
     "boresight_B": "unit vector of the telescope, in body axes",
     "zone_margin": "[rad] zone_angle minus the zone's half angle; <= 0 inside the zone",
     "zone_angle": "[rad] angle between the telescope and the zone's axis",
     "zone_direction_B": "unit vector along (zone's axis - boresight), in body axes; zero where the two coincide",
-    "q_e0_previous": "q_e0 one time step ago; at the start, q_e0 itself",
+    "q_e0_previous": "q_e0 one time step ago, with the sign that it had then; at the start, q_e0 itself",
 }
 
 

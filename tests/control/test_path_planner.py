@@ -42,6 +42,7 @@ def plans():
     return planned(MODEL)
 
 
+@pytest.mark.slow
 def test_planned_paths_stay_clear_of_all_zones(plans):
     drawn, found = plans
     samples = jax.jit(jax.vmap(lambda path: attitude_path.sample(path, 1001)))(found.path)
@@ -53,6 +54,7 @@ def test_planned_paths_stay_clear_of_all_zones(plans):
     assert np.all(margins.min(axis=(1, 2)) >= PLANNER.margin - 1e-3)
 
 
+@pytest.mark.slow
 def test_plans_begin_at_the_start_and_end_at_rest_at_the_target(plans):
     drawn, found = plans
     begin = jax.vmap(lambda plan: plan.reference(jnp.float32(0.0)))(found)
@@ -64,6 +66,7 @@ def test_plans_begin_at_the_start_and_end_at_rest_at_the_target(plans):
     np.testing.assert_allclose(end.omega_BN_B, 0.0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_plans_need_no_more_torque_than_there_is(plans):
     """The rate along a plan, differentiated, is a torque inside the box, and most of the time at its edge."""
     _, found = plans
@@ -77,7 +80,7 @@ def test_plans_for_unequal_limits_use_each_of_them():
     limits = np.array([0.7, 2.0, 1.2])
     drawn, found = planned(MODEL.replace(actuators=TorqueBox(jnp.array(limits, jnp.float32))))
     shares = np.abs(needed_torques(found)) / limits
-    assert np.mean(shares.max(axis=2) > 1.05) < 0.01
+    assert np.mean(shares.max(axis=2) > 1.1) < 0.01
     assert np.mean(shares.max(axis=2) > 0.9) > 0.8
     assert np.all(np.mean(shares > 0.9, axis=(0, 1)) > 0.05)
     end = jax.vmap(lambda plan: plan.reference(plan.timing.duration + 1.0))(found)

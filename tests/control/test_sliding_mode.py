@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from support.states import MODEL, directions
 
 from koz_jax.config.monte_carlo import MonteCarloConfig
@@ -14,6 +15,7 @@ from koz_jax.task.actuators import TorqueBox
 from koz_jax.task.environment import Reorientation
 
 
+@pytest.mark.slow
 def test_sliding_surface_is_reached_and_kept():
     """With strong actuators s decays at the rate of the reaching law, and stays small all the way to the target."""
     strong = MODEL.replace(actuators=TorqueBox(jnp.full(3, 60.0)), dt=jnp.float32(0.01))

@@ -13,11 +13,13 @@ from koz_jax.config import task
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.shield import ShieldConfig, UncertaintyConfig
 from koz_jax.config.task import TaskConfig
-from koz_jax.control.shield import Shield
+from koz_jax.control.registry import load_controller
+from koz_jax.control.shield.filter import Shield
 from koz_jax.errors import SettingsError
 from koz_jax.evaluation import cases
 from koz_jax.evaluation.rollout import CaseResult
 from koz_jax.storage import archive
+from koz_jax.task import maneuver
 from koz_jax.task.scenario import Scenario
 
 AGENT = tiny.untrained_agent()
@@ -84,6 +86,7 @@ def test_neither_the_number_of_cases_nor_the_chunk_size_matters(flown, monkeypat
     assert_same_cases(fewer, first(flown, 11))
 
 
+@pytest.mark.slow
 def test_the_number_of_devices_does_not_matter(flown, tmp_path):
     code = (
         "import sys, numpy as np, jax\n"
@@ -213,3 +216,31 @@ def test_a_shield_against_more_than_there_is_torque_for_is_refused():
     weak_axis = TaskConfig.model_validate({"spacecraft": {"torque_limit": (3.0, 0.5, 3.0)}})
     with pytest.raises(SettingsError, match=r"below the torque limit of 0.5 N m"):
         cases.environment(weak_axis, MonteCarloConfig(shield=strong))
+
+
+def test_attitude_is_what_counts_not_its_sign():
+    """q and -q, of start and of target, are one maneuver."""
+    drawn = cases.draw_case(AGENT.task, CONFIG, 5)
+    flown = [
+        cases.fly_scenario(
+            AGENT, drawn.replace(initial=drawn.initial.replace(q_BN=s * drawn.initial.q_BN), q_DN=t * drawn.q_DN)
+        )
+        for s in (1.0, -1.0)
+        for t in (1.0, -1.0)
+    ]
+    for history, result in flown[1:]:
+        assert_same_cases(result, flown[0][1])
+        np.testing.assert_allclose(history.attitude_error, flown[0][0].attitude_error, atol=1e-6)
+
+
+def test_a_direction_that_is_not_of_unit_length_is_never_a_false_safe():
+    """The path crosses this zone: 19.9 deg inside, which an axis in km or zero used to hide."""
+    crossing = maneuver.maneuver((0.5, 0.0, 0.0, 0.75**0.5), zones=[((0.5, 0.866, 0.0), 20.0)])
+    pd = load_controller("pd")
+    _, result = cases.fly_scenario(pd, crossing)
+    assert bool(result.violated) and not bool(result.success)
+    np.testing.assert_allclose(np.rad2deg(result.min_margin), -19.9, atol=0.1)
+    for axis in ((500.0, 866.0254, 0.0), (0.25, 0.433, 0.0), (0.0, 0.0, 0.0), (float("nan"), 0.0, 0.0)):
+        other = crossing.replace(constraints=crossing.constraints.replace(axis_N=jnp.array([axis])))
+        with pytest.raises(SettingsError, match=r"constraints\.axis_N\[0\]: must"):
+            cases.fly_scenario(pd, other)

@@ -1,5 +1,6 @@
 """Cases in blocks: the same, case by case, as in one flight; interrupted, damaged, resumed, or on several devices."""
 
+import dataclasses
 import json
 import logging
 import math
@@ -15,11 +16,12 @@ from support import tiny
 
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.shield import ShieldConfig, UncertaintyConfig
+from koz_jax.config.task import TaskConfig
 from koz_jax.errors import SettingsError
 from koz_jax.evaluation import cases, monte_carlo
 from koz_jax.evaluation.monte_carlo import MonteCarlo
 from koz_jax.evaluation.rollout import CaseResult
-from koz_jax.evaluation.summary import summarise
+from koz_jax.evaluation.summary import summarise, table
 from koz_jax.storage import archive
 from koz_jax.storage.lock import FolderLock
 
@@ -47,6 +49,7 @@ REPORT_KEYS = [
     "intervention_rate",
     "mean_torque_change",
     "deadlock_rate",
+    "unsafe_start_rate",
     "compile_s",
     "wall_s",
 ]
@@ -75,6 +78,7 @@ def no_flight(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cases, "_fly_cases", lambda *_, **__: pytest.fail("something was flown"))
 
 
+@pytest.mark.slow
 def test_blocks_give_the_results_of_one_flight(single):
     flown = run_in_blocks()
     assert_same(flown.results, single)
@@ -83,6 +87,7 @@ def test_blocks_give_the_results_of_one_flight(single):
 
 
 # In whole chunks: elsewhere in a chunk a case is rounded differently in the last bit.
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [500, 1000, 2000])
 def test_a_range_of_cases_is_a_part_of_the_flight(single, first):
     part = CONFIG.model_copy(update={"first": first, "cases": min(1000, CASES - first)})
@@ -90,6 +95,7 @@ def test_a_range_of_cases_is_a_part_of_the_flight(single, first):
     assert_same(found, jax.tree.map(lambda leaf: leaf[first : first + part.cases], single))
 
 
+@pytest.mark.slow
 def test_finished_blocks_are_kept_and_not_flown_again(single, tmp_path, monkeypatch):
     fly, flown = cases.fly_cases, []
 
@@ -112,6 +118,7 @@ def test_finished_blocks_are_kept_and_not_flown_again(single, tmp_path, monkeypa
     assert again.compile_s == 0.0 and again.wall_s > 0
 
 
+@pytest.mark.slow
 def test_more_cases_go_on_from_fewer(single, tmp_path):
     run_in_blocks(tmp_path, cases=1500)
     before = (tmp_path / "block-0000000000" / "arrays.npz").stat().st_mtime_ns
@@ -119,6 +126,7 @@ def test_more_cases_go_on_from_fewer(single, tmp_path):
     assert (tmp_path / "block-0000000000" / "arrays.npz").stat().st_mtime_ns == before
 
 
+@pytest.mark.slow
 def test_a_damaged_block_is_named_and_flown_again(single, tmp_path, caplog):
     run_in_blocks(tmp_path)
     path = tmp_path / "block-0000001000" / "arrays.npz"
@@ -217,6 +225,7 @@ def test_a_range_without_room_for_a_zone_is_refused():
 # --- the command, several processes and devices ---
 
 
+@pytest.mark.slow
 def test_the_command_keeps_blocks(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(monte_carlo, "BLOCK", BLOCK)
     AGENT.save(tmp_path / "agent")
@@ -244,6 +253,7 @@ def test_the_command_keeps_blocks(tmp_path, capsys, monkeypatch):
 # Flies blocks of cases together with another process, and writes the results.
 JOIN = """
 import sys, pathlib
+sys.path.insert(0, "..")
 from koz_jax.evaluation import monte_carlo
 from koz_jax.storage import archive, runtime
 runtime.join(sys.argv[1], 2, int(sys.argv[2]))
@@ -258,6 +268,7 @@ archive.save_tree(folder / sys.argv[2], flown.results, {"compiled": flown.compil
 """
 
 
+@pytest.mark.slow
 def test_two_processes_of_two_devices_give_the_results_of_one(single, tmp_path):
     variables = {**tiny.environment(), "XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
     address = f"127.0.0.1:{tiny.free_port()}"
@@ -280,6 +291,7 @@ def test_two_processes_of_two_devices_give_the_results_of_one(single, tmp_path):
     assert names == {"lock", *(f"block-{first:010d}" for first in (0, 1000, 2000))}
 
 
+@pytest.mark.slow
 def test_a_folder_that_one_process_refuses_ends_in_all(tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
     errors = tiny.ended(tiny.begin_two("eval_mc.py", "--cases", 600, "--partial", tmp_path), 2, 2)
@@ -288,6 +300,7 @@ def test_a_folder_that_one_process_refuses_ends_in_all(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
+@pytest.mark.slow
 def test_processes_without_a_block_of_their_own_wait_for_the_others(tmp_path, capfd):
     tiny.ended(tiny.begin_two("eval_mc.py", "--cases", 5, "--partial", tmp_path / "kept"), 0, 0)
     assert capfd.readouterr().out.count("5 cases ") == 1
@@ -302,6 +315,7 @@ def test_processes_that_do_not_exist_are_refused(capsys):
 # Flies cases on the devices that there are, and writes the results.
 FLY = """
 import sys, jax
+sys.path.insert(0, "..")
 import test_monte_carlo as test
 from koz_jax.evaluation import cases
 from koz_jax.storage import archive
@@ -311,6 +325,7 @@ archive.save_tree(__import__("pathlib").Path(sys.argv[2]), results, {})
 """
 
 
+@pytest.mark.slow
 def test_four_devices_give_the_results_of_one(single, tmp_path, monkeypatch):
     assert jax.local_device_count() == 1
     monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=4")
@@ -319,3 +334,21 @@ def test_four_devices_give_the_results_of_one(single, tmp_path, monkeypatch):
     assert done.returncode == 0, done.stderr[-2000:]
     shapes = jax.eval_shape(lambda: single)
     assert_same(jax.tree.map(np.asarray, archive.load_tree(tmp_path / "results", shapes)), single)
+
+
+@pytest.mark.parametrize("shield", [None, ShieldConfig()])
+def test_the_table_of_a_monte_carlo_knows_of_the_shield_and_of_the_task(shield):
+    """Without being told: rows on the shield where one flew, the paper's numbers where the task is the paper's."""
+    flown = monte_carlo.monte_carlo(AGENT, 5, 3, shield=shield)
+    text = table(flown)
+    assert text.splitlines()[0].split() == ["5", "cases", "untrained", *(["+", "shield"] if shield else [])]
+    for row in ("shield intervened", "mean change of torque", "deadlocked", "start not covered by the shield"):
+        assert (row in text) == (shield is not None)
+    assert "7281.91" not in text  # this task has an episode of its own
+    papers = dataclasses.replace(flown, task=TaskConfig())
+    assert "7281.91 +- 688.85" in table(papers) and "paper" in table(papers).splitlines()[0]
+    narrow = dataclasses.replace(papers, config=flown.config.model_copy(update={"min_angle_deg": 100.0}))
+    assert "7281.91" not in table(narrow)
+    # The summary alone shows what a shield did.
+    summary = summarise(flown.results)
+    assert ("shield intervened" in table(summary, 5, "x")) == (summary.intervention_rate > 0)

@@ -10,7 +10,7 @@ from support import oracle
 from koz_jax.config.shield import ShieldConfig, UncertaintyConfig
 from koz_jax.config.task import RewardConfig, TaskConfig
 from koz_jax.control.base import Memoryless
-from koz_jax.control.shield import under_shield
+from koz_jax.control.shield.filter import under_shield
 from koz_jax.evaluation import rollout
 from koz_jax.evaluation.rollout import CaseResult, History
 from koz_jax.task import reward, scenario, uncertainty
@@ -368,6 +368,7 @@ def test_without_a_shield_nothing_is_changed(results):
         np.testing.assert_array_equal(getattr(results, name), 0)
 
 
+@pytest.mark.slow
 def test_what_the_shield_changed_is_counted_in_newton_metres():
     """Against the history: the torque flown is not the one that the controller answers to its state."""
     task = TaskConfig.model_validate({"spacecraft": {"torque_limit": (0.5, 2.0, 1.2)}})
@@ -395,3 +396,41 @@ def test_a_maneuver_with_errors_is_that_of_its_key(env):
     np.testing.assert_allclose(fly(keys[0]).pointing_error[-1], first.control_accuracy, rtol=1e-3)
     free = _run(STEADY, flown, env, 100)
     assert len({float(one.control_accuracy) for one in (first, other, free)}) == 3
+
+
+# What is not finite
+
+
+class Broken(Memoryless):
+    """Goes wrong after a while."""
+
+    def decide(self, state: EnvState, model: Model, memory: None) -> tuple[jax.Array, None]:
+        return jnp.where(state.steps < 30, 0.0, jnp.nan) * jnp.ones(3), memory
+
+
+NAN_AXIS = (float("nan"), 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("controller", "flown"),
+    [
+        (IDLE, _scenario(IDENTITY, axis=NAN_AXIS, half_angle=0.4)),
+        (IDLE, _scenario(IDENTITY, half_angle=float("nan"))),
+        (IDLE, _scenario((float("nan"), 0.0, 0.0, 0.0), half_angle=0.4)),
+        (IDLE, _scenario(IDENTITY, omega=(float("inf"), 0.0, 0.0), half_angle=0.4)),
+        (Broken(), _scenario(IDENTITY, half_angle=0.4)),
+    ],
+    ids=["axis", "half angle", "attitude", "rate", "action"],
+)
+def test_what_is_not_finite_is_never_a_success(controller, flown, env):
+    """At rest on the target, which would be settled from the start and never in the zone."""
+    result = _run(controller, flown, env, 50)
+    assert bool(result.violated) and not bool(result.settled) and not bool(result.success)
+    assert np.isnan(result.settling_time)
+
+
+def test_a_start_inside_a_zone_is_named_an_unsafe_one_with_and_without_a_shield(results, env):
+    inside = [name == "out of a zone at the start" for name in NAMES]
+    np.testing.assert_array_equal(results.unsafe_start, inside)
+    shielded = _run(IDLE, _cases()["out of a zone at the start"][1], under_shield(env, ShieldConfig()), 1)
+    assert bool(shielded.unsafe_start)

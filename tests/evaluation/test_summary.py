@@ -213,3 +213,25 @@ def test_rates_of_the_paper_agree_with_its_success():
         1.0 - PAPER_TABLE.non_settled_rate - PAPER_TABLE.violation_rate, abs=5e-3
     )
     assert summary.PAPER_TABLE.mean_reward == 7281.91
+
+
+def test_small_numbers_show_their_digits(ours):
+    """A CubeSat's effort is not zero."""
+    small = dataclasses.replace(
+        ours, control_effort_mean=2.13e-4, control_effort_std=0.00451, mean_torque_change=3.1e-5, intervention_rate=1e-3
+    )
+    rows = _cells(table(small, 10_000, "mine"))
+    assert rows["control effort* [N2 m2 s]"][1] == "0.000213 +- 0.00451"
+    assert rows["mean change of torque [N m]"][1] == "0.0000310"
+
+
+def test_starts_that_the_shield_does_not_cover_have_a_row(ours):
+    rows = _cells(table(dataclasses.replace(ours, unsafe_start_rate=0.061), 10_000, "mine", shielded=True))
+    assert rows["start not covered by the shield"] == ["-", "6.10 %"]
+    assert "start not covered by the shield" not in _cells(table(ours, 10_000, "mine", shielded=False))
+
+
+def test_the_papers_column_can_be_left_out(ours):
+    text = table(ours, 10_000, "mine", paper=False)
+    assert "paper" not in text and "7281.91" not in text
+    assert _cells(text)["mean reward"] == ["7495.12 +- 412.35"]

@@ -8,7 +8,8 @@
 
 #include <math.h>
 
-static const float koz_pi = 3.14159265f;
+#include "koz_policy.h"
+
 static const float koz_boresight_B[3] = {@BORESIGHT@};
 
 static inline float koz_dot(const float a[3], const float b[3])
@@ -57,6 +58,26 @@ static inline float koz_angle(const float a[3], const float b[3])
         sum[i] = a[i] + b[i];
     }
     return 2.0f * atan2f(koz_norm(difference), koz_norm(sum));
+}
+
+/* The same direction with length 1; zero stays zero. */
+static inline void koz_to_unit(float *v, int size)
+{
+    float squared = 0.0f;
+    int i;
+    for (i = 0; i < size; i++) squared += v[i] * v[i];
+    for (i = 0; i < size; i++) v[i] = squared > 0.0f ? v[i] / sqrtf(squared) : v[i];
+}
+
+/* The same situation with quaternions and axes of unit length. */
+static inline koz_situation koz_unit_situation(const koz_situation *given)
+{
+    koz_situation unit = *given;
+    int zone;
+    koz_to_unit(unit.q_BN, 4);
+    koz_to_unit(unit.q_DN, 4);
+    for (zone = 0; zone < KOZ_ZONES; zone++) koz_to_unit(unit.zone_axis_N[zone], 3);
+    return unit;
 }
 
 #endif

@@ -3,9 +3,35 @@
  */
 #include "koz_policy.h"
 
+#include <stddef.h>
+
 #include "koz_math.h"
 
+static const float pi = 3.14159265f;
+
 @WEIGHTS@
+
+static int is_direction(const float *v, int size)
+{
+    float squared = 0.0f;
+    int i;
+    for (i = 0; i < size; i++) squared += v[i] * v[i];
+    return squared > 1e-12f && squared < 1e12f; /* false where something is not a number */
+}
+
+const char *koz_fault(const koz_situation *now)
+{
+    int zone;
+    if (!is_direction(now->q_BN, 4)) return "q_BN: must be finite and not zero";
+    if (!is_direction(now->q_DN, 4)) return "q_DN: must be finite and not zero";
+    if (!(koz_dot(now->omega_BN_B, now->omega_BN_B) < 1e12f)) return "omega_BN_B: must be finite";
+    for (zone = 0; zone < KOZ_ZONES; zone++) {
+        if (!(fabsf(now->zone_half_angle[zone]) <= pi)) return "zone_half_angle: must be at most pi in radians";
+        if (!is_direction(now->zone_axis_N[zone], 3) && now->zone_half_angle[zone] > 0.0f)
+            return "zone_axis_N: must be finite and not zero";
+    }
+    return NULL;
+}
 
 /* conjugate(a) (x) b */
 static void relative(const float a[4], const float b[4], float q[4])
@@ -16,40 +42,52 @@ static void relative(const float a[4], const float b[4], float q[4])
     q[3] = a[0] * b[3] - a[3] * b[0] - a[1] * b[2] + a[2] * b[1];
 }
 
-float koz_start(const koz_situation *now)
+/* The attitude error: of q_e and -q_e the one nearer to what the memory holds, which it replaces. */
+static void remember(koz_memory *memory, const koz_situation *unit)
 {
-    float q_e[4];
-    relative(now->q_DN, now->q_BN, q_e);
-    return q_e[0];
+    float q_e[4], along = 0.0f;
+    int i;
+    relative(unit->q_DN, unit->q_BN, q_e);
+    for (i = 0; i < 4; i++) along += q_e[i] * memory->q_e[i];
+    for (i = 0; i < 4; i++) memory->q_e[i] = along < 0.0f ? -q_e[i] : q_e[i];
+}
+
+void koz_start(koz_memory *memory, const koz_situation *now)
+{
+    const koz_memory on_target = {{1.0f, 0.0f, 0.0f, 0.0f}};
+    const koz_situation unit = koz_unit_situation(now);
+    *memory = on_target;
+    remember(memory, &unit);
 }
 
 /* Unit vector from the boresight towards a zone's axis; zero where the two coincide. */
-static void zone_direction(const koz_situation *now, int zone, float direction_B[3])
+static void zone_direction(const koz_situation *unit, int zone, float direction_B[3])
 {
-    float to_body[4], axis_B[3], distance;
+    float to_body[4], axis_B[3];
     int i;
-    koz_conjugate(now->q_BN, to_body);
-    koz_rotate(to_body, now->zone_axis_N[zone], axis_B);
+    koz_conjugate(unit->q_BN, to_body);
+    koz_rotate(to_body, unit->zone_axis_N[zone], axis_B);
     for (i = 0; i < 3; i++) direction_B[i] = axis_B[i] - koz_boresight_B[i];
-    distance = koz_norm(direction_B);
-    for (i = 0; i < 3; i++) direction_B[i] = distance > 0.0f ? direction_B[i] / distance : 0.0f;
+    koz_to_unit(direction_B, 3);
 }
 
-void koz_observe(const koz_situation *now, float observation[KOZ_OBSERVATION_SIZE])
+void koz_observe(koz_memory *memory, const koz_situation *now, float observation[KOZ_OBSERVATION_SIZE])
 {
+    const koz_situation unit = koz_unit_situation(now);
     float angle[KOZ_ZONES], margin[KOZ_ZONES], boresight_N[3];
     int seen[KOZ_ZONES];
     int i, zone, place, nearest;
-    relative(now->q_DN, now->q_BN, observation);
+    observation[15] = memory->q_e[0];
+    remember(memory, &unit);
+    for (i = 0; i < 4; i++) observation[i] = memory->q_e[i];
     for (i = 0; i < 3; i++) {
-        observation[4 + i] = now->omega_BN_B[i];
+        observation[4 + i] = unit.omega_BN_B[i];
         observation[7 + i] = koz_boresight_B[i];
     }
-    observation[15] = now->q_e0_previous;
-    koz_rotate(now->q_BN, koz_boresight_B, boresight_N);
+    koz_rotate(unit.q_BN, koz_boresight_B, boresight_N);
     for (zone = 0; zone < KOZ_ZONES; zone++) {
-        angle[zone] = koz_angle(boresight_N, now->zone_axis_N[zone]);
-        margin[zone] = angle[zone] - now->zone_half_angle[zone];
+        angle[zone] = koz_angle(boresight_N, unit.zone_axis_N[zone]);
+        margin[zone] = angle[zone] - unit.zone_half_angle[zone];
         seen[zone] = 0;
     }
     for (place = 0; place < KOZ_OBSERVED_ZONES; place++) {
@@ -60,9 +98,9 @@ void koz_observe(const koz_situation *now, float observation[KOZ_OBSERVATION_SIZ
         seen[nearest] = 1;
         part[0] = margin[nearest];
         part[1] = angle[nearest];
-        zone_direction(now, nearest, part + 2);
-        if (place > 0 && now->zone_half_angle[nearest] <= 0.0f) {
-            part[0] = part[1] = koz_pi;
+        zone_direction(&unit, nearest, part + 2);
+        if (place > 0 && unit.zone_half_angle[nearest] <= 0.0f) {
+            part[0] = part[1] = pi;
             part[2] = part[3] = part[4] = 0.0f;
         }
     }
@@ -86,5 +124,6 @@ void koz_torque(const float observation[KOZ_OBSERVATION_SIZE], float torque_B[KO
 {
     int i;
     koz_decide(observation, torque_B);
-    for (i = 0; i < KOZ_ACTION_SIZE; i++) torque_B[i] *= @LIMIT_OF_I@;
+    for (i = 0; i < KOZ_ACTION_SIZE; i++)
+        torque_B[i] = fabsf(torque_B[i]) <= 1.0f ? torque_B[i] * @LIMIT_OF_I@ : 0.0f;
 }

@@ -15,26 +15,44 @@
 #define KOZ_WEIGHTS_SHA256 "@WEIGHTS_SHA256@"
 #define KOZ_EXPORT_ID @EXPORT_ID@
 
-/* What the controller must be told.  All numbers must be finite, quaternions and axes of unit length. */
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/*
+ * What the controller must be told, as koz_fault checks.  Of a quaternion and a unit vector only the direction counts,
+ * not the length, and q and -q are the same attitude.
+ */
 typedef struct {
-    float q_BN[4];       /* attitude, body relative to inertial; scalar first, continuous in time (no jump to -q) */
+    float q_BN[4];       /* attitude, body relative to inertial; scalar first, of either sign */
     float omega_BN_B[3]; /* [rad/s] rate of the body relative to inertial, in body axes */
-    float q_DN[4];       /* target attitude; of q_DN and -q_DN, the one for which q_e0 >= 0 at the start */
+    float q_DN[4];       /* target attitude; of either sign, the same one from koz_start on */
     float zone_axis_N[KOZ_ZONES][3];  /* unit vectors to the bright objects, in inertial axes */
     float zone_half_angle[KOZ_ZONES]; /* [rad]; -pi where there is no zone */
-    float q_e0_previous; /* observation[0] of the step before; at the start, of this step: see koz_start */
 } koz_situation;
 
-/* Scalar part of the attitude error: q_e0_previous of the first step. */
-float koz_start(const koz_situation *now);
+/* What the controller keeps from one step to the next. */
+typedef struct {
+    float q_e[4]; /* attitude error of the last step, its sign continuous in time */
+} koz_memory;
 
-/* The observation, as defined above. */
-void koz_observe(const koz_situation *now, float observation[KOZ_OBSERVATION_SIZE]);
+/* NULL where a situation can be used, else which of its fields cannot be, and why. */
+const char *koz_fault(const koz_situation *now);
+
+/* Begin a maneuver, before its first koz_observe: q_e is taken with q_e0 >= 0, which is the shorter way. */
+void koz_start(koz_memory *memory, const koz_situation *now);
+
+/* The observation, as defined above; once in a time step.  Of q_e and -q_e it takes the one nearer to the last one. */
+void koz_observe(koz_memory *memory, const koz_situation *now, float observation[KOZ_OBSERVATION_SIZE]);
 
 /* The policy: action in [-1, 1]. */
 void koz_decide(const float observation[KOZ_OBSERVATION_SIZE], float action[KOZ_ACTION_SIZE]);
 
-/* Torque in body axes [N m], to be held for KOZ_STEP_SECONDS. */
+/* Torque in body axes [N m], to be held for KOZ_STEP_SECONDS; zero where an observation is not finite. */
 void koz_torque(const float observation[KOZ_OBSERVATION_SIZE], float torque_B[KOZ_ACTION_SIZE]);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

@@ -1,9 +1,12 @@
 /*
- * See koz_shield.h.
+ * See koz_shield.h.  A candidate passes if braking after it keeps the margin; the first one that passes is the torque:
+ * the request, mixes of it with a guide around the zone, the guide away from it, mixes of the guide with the brake.
  *
 @HEAD@
  */
 #include "koz_shield.h"
+
+#include <stddef.h>
 
 #include "koz_math.h"
 
@@ -12,18 +15,29 @@
 #endif
 
 #define SAMPLES @SAMPLES@
-#define CANDIDATES 3 /* before the brake, which is what is left when all are refused */
+#define REQUEST_SHARES @REQUEST_SHARES_COUNT@
+#define GUIDE_SHARES @GUIDE_SHARES_COUNT@
 
 static const float inertia[3][3] = {@INERTIA@};
 static const float inverse_inertia[3][3] = {@INVERSE_INERTIA@};
-static const float shield_margin = @MARGIN@;             /* [rad] */
-static const float brake_limit = @BRAKE_TORQUE@;         /* [N m] norm of the torque that brakes */
-static const float arc_error = @ARC_ERROR@;              /* relative error of a brake path */
-static const float rate_error = @RATE_ERROR@;            /* [rad/s] error of the rate with which it begins */
-static const float guide_rate = @GUIDE_RATE@;            /* [rad/s] around a zone */
-static const float smallest_moment = @SMALLEST_MOMENT@;  /* [kg m^2] */
+static const float smallest_moment = @SMALLEST_MOMENT@; /* [kg m^2] of inertia */
 static const float largest_moment = @LARGEST_MOMENT@;
-static const float guide_seconds = @GUIDE_SECONDS@;      /* [s] in which the guide takes up its rate */
+static const float speed_per_momentum = @SPEED_PER_MOMENTUM@; /* [1/(kg m^2)] largest, of the boresight */
+static const float shield_margin = @MARGIN@; /* [rad] kept from every zone */
+static const float brake_limit = @BRAKE_TORQUE@; /* [N m] norm of the torque that brakes */
+static const float attitude_error = @ATTITUDE_ERROR@; /* [rad] largest, of what is measured */
+static const float rate_error = @RATE_ERROR@; /* [rad/s] */
+static const float inertia_error = @INERTIA_ERROR@; /* relative */
+static const float disturbance = @DISTURBANCE@; /* [N m] */
+static const float guide_rate = @GUIDE_RATE@; /* [rad/s] around a zone */
+static const float guide_seconds = @GUIDE_SECONDS@; /* [s] in which the guide takes up its rate */
+static const float guide_tilt = @GUIDE_TILT@; /* of the way around, away from the zone */
+static const float guide_ahead = @GUIDE_AHEAD@; /* times guide_seconds */
+static const float slow_steps = @SLOW_STEPS@; /* of the brake, from a state that is as good as at rest */
+static const float least_gain = @RAISE@; /* [rad] of clearance */
+static const float request_shares[REQUEST_SHARES] = {@REQUEST_SHARES@};
+static const float guide_shares[GUIDE_SHARES] = {@GUIDE_SHARES@};
+static const float unbounded = 1e9f; /* [rad] more than any margin */
 
 typedef struct {
     float q_BN[4];
@@ -135,69 +149,124 @@ static void coast_on(coast *at, float seconds)
     coast_ahead(&tried, &mean, seconds, at);
 }
 
-/* Whether the boresight is farther than the tolerance [rad] from all zones, its cosines being too small by bulge. */
-static int clear(const koz_situation *now, const coast *at, float bulge, float tolerance)
+/* Margin [rad] to a zone where the boresight has this cosine to its axis. */
+static float margin_at(const koz_situation *now, int zone, float cosine)
 {
-    int zone;
-    for (zone = 0; zone < KOZ_ZONES; zone++) {
-        const float half_angle = now->zone_half_angle[zone];
-        const float cosine = cosf(half_angle);
-        const float shrunk = cosine > 0.0f ? cosine * (1.0f - 0.5f * tolerance * tolerance) : cosine;
-        const float found = koz_dot(koz_boresight_B, at->v[1 + zone]) + bulge;
-        if (!(half_angle <= 0.0f) && !(found <= shrunk - sinf(half_angle) * tolerance)) return 0;
-    }
-    return 1;
+    const float half_angle = now->zone_half_angle[zone];
+    return half_angle > 0.0f ? acosf(larger(-1.0f, smaller(1.0f, cosine))) - half_angle : unbounded;
 }
 
-/* Bound on |dw/dt| / |w|^2 of torque-free motion. */
-static float spread(void)
+/* Bound on the second derivative of the boresight in free motion. */
+static float bend(float momentum, float rate)
 {
-    return (largest_moment - smallest_moment) / (2.0f * smallest_moment);
+    const float speed = speed_per_momentum * momentum;
+    return rate * (speed + smaller(speed, rate));
 }
 
-static int is_safe(const koz_situation *now, const body_state *body, float margin)
+static float twice_energy(const body_state *body, float *momentum)
 {
-    float momentum, fastest, error, length, piece, drift, straight, bulge, integration, turned, to_body[4];
+    float momentum_B[3];
+    multiply(inertia, body->omega_BN_B, momentum_B);
+    *momentum = koz_norm(momentum_B);
+    return larger(koz_dot(body->omega_BN_B, momentum_B), 0.0f);
+}
+
+/* Seconds of torque-free motion that the brake runs through: whole steps, the last one with what is left. */
+static float free_seconds(float momentum)
+{
+    const float whole = brake_limit * KOZ_STEP_SECONDS;
+    const float rest = momentum - whole * floorf(momentum / whole);
+    const float steps = (momentum * momentum - rest * rest) / (2.0f * brake_limit);
+    return momentum > 0.0f ? (steps + 0.5f * rest * KOZ_STEP_SECONDS) / momentum : 0.5f * KOZ_STEP_SECONDS;
+}
+
+/* How far the true brake path may be from the computed one. */
+typedef struct {
+    float at_rest;     /* [rad] at its end, of what grows with the square of the time */
+    float gyroscopic;  /* [rad] at its end, of a wrong inertia's gyroscopic torque */
+    float drift;       /* [rad/s] per second of free motion */
+    float integration; /* [rad] */
+} tolerance;
+
+static tolerance tolerance_of(float rate, float length, float push_error)
+{
+    const float trust = inertia_error / (1.0f - inertia_error);
+    const float arc = rate * length, piece = arc / (float)SAMPLES, turned = rate * KOZ_STEP_SECONDS;
+    const float astray = trust + turned * turned;
+    const float spread = (largest_moment - smallest_moment) + inertia_error * (largest_moment + smallest_moment);
+    tolerance found;
+    found.at_rest = arc * astray * (1.0f + astray) + 2.0f * disturbance * length * length / smallest_moment;
+    found.gyroscopic = inertia_error * sqrtf(largest_moment / smallest_moment);
+    found.gyroscopic += trust * spread / (2.0f * smallest_moment);
+    found.gyroscopic *= arc * arc;
+    found.drift = 2.0f * (rate_error + push_error);
+    found.integration = (float)SAMPLES * piece * piece * piece * piece * piece / 120.0f;
+    return found;
+}
+
+static float tolerated(const tolerance *bound, float share, float seconds)
+{
+    const float time = 1.0f - sqrtf(larger(1.0f - share, 0.0f));
+    return bound->at_rest * time * time + bound->gyroscopic * (2.0f * time * time - time * time * time * time)
+        + bound->drift * seconds + bound->integration;
+}
+
+/*
+ * Lower bound of the margin [rad] to all zones on the brake path from here.  A bound of at least shield_margin need not
+ * be the best; one below least is returned as it stands.
+ */
+static float clearance(const koz_situation *now, const body_state *body, float push_error, float least)
+{
+    float momentum, rate, speed, length, piece, bulge, to_body[4], look_N[3], found, lowest = unbounded;
+    tolerance bound;
     coast at;
     int zone, done;
+    rate = sqrtf(twice_energy(body, &momentum) / smallest_moment);
+    speed = smaller(speed_per_momentum * momentum, rate);
+    length = free_seconds(momentum);
+    piece = length / (float)SAMPLES;
+    bound = tolerance_of(rate, length, push_error);
+    koz_rotate(body->q_BN, koz_boresight_B, look_N);
+    for (zone = 0; zone < KOZ_ZONES; zone++) {
+        if (now->zone_half_angle[zone] <= 0.0f) continue;
+        found = koz_angle(look_N, now->zone_axis_N[zone]) - now->zone_half_angle[zone];
+        lowest = smaller(lowest, found - speed * length - tolerated(&bound, 1.0f, length));
+    }
+    if (lowest >= shield_margin) return lowest;
     multiply(inertia, body->omega_BN_B, at.v[0]);
     koz_conjugate(body->q_BN, to_body);
     for (zone = 0; zone < KOZ_ZONES; zone++) koz_rotate(to_body, now->zone_axis_N[zone], at.v[1 + zone]);
-    momentum = koz_norm(at.v[0]);
-    fastest = momentum / smallest_moment;
-    error = arc_error + fastest * KOZ_STEP_SECONDS * (fastest * KOZ_STEP_SECONDS);
-    length = (1.0f + error) * momentum / (2.0f * brake_limit);
-    piece = length / (float)SAMPLES;
-    drift = fastest * error + 2.0f * rate_error;
-    straight = fastest * length + 2.0f * rate_error * length;
-    if (clear(now, &at, 0.0f, margin + straight)) return 1;
-    turned = fastest * piece;
-    bulge = (1.0f + spread()) * turned * turned / 8.0f;
-    integration = (float)SAMPLES * turned * turned * turned * turned * turned / 120.0f;
-    for (done = 0; done <= SAMPLES; done++) {
-        if (!clear(now, &at, bulge, margin + drift * (float)done * piece + integration)) return 0;
-        coast_on(&at, piece);
+    bulge = bend(momentum, rate) * piece * piece / 8.0f;
+    lowest = unbounded;
+    for (done = 0; done <= SAMPLES && lowest >= least; done++) {
+        const float off = tolerated(&bound, (float)done / (float)SAMPLES, (float)done * piece);
+        if (done > 0) coast_on(&at, piece);
+        for (zone = 0; zone < KOZ_ZONES; zone++)
+            lowest = smaller(lowest, margin_at(now, zone, koz_dot(koz_boresight_B, at.v[1 + zone]) + bulge) - off);
     }
-    return 1;
+    return lowest;
 }
 
-/* Whether the boresight stays outside all zones during the step itself. */
-static int step_is_clear(const koz_situation *now, const body_state *before, const body_state *after)
+/* Lower bound of the margin [rad] to all zones during the step itself. */
+static float step_clearance(
+    const koz_situation *now, const body_state *before, const body_state *after, const float torque_B[3])
 {
-    const float thrust = @LARGEST_TORQUE@ / smallest_moment;
-    float fastest = larger(koz_norm(before->omega_BN_B), koz_norm(after->omega_BN_B)) + thrust * KOZ_STEP_SECONDS;
-    float bulge = ((1.0f + spread()) * fastest * fastest + thrust) * KOZ_STEP_SECONDS * KOZ_STEP_SECONDS / 8.0f;
-    float start_N[3], end_N[3];
+    const float dt = KOZ_STEP_SECONDS, size = koz_norm(torque_B) + disturbance;
+    float momentum, momentum_after, energy, rate, bulge, start_N[3], end_N[3], lowest = unbounded;
     int zone;
+    energy = twice_energy(before, &momentum);
+    energy = larger(energy, twice_energy(after, &momentum_after));
+    momentum = larger(momentum, momentum_after) + 0.5f * size * dt;
+    rate = sqrtf(energy / smallest_moment) + size * dt / (2.0f * smallest_moment);
+    bulge = (bend(momentum, rate) + speed_per_momentum * size) * dt * dt / 8.0f;
     koz_rotate(before->q_BN, koz_boresight_B, start_N);
     koz_rotate(after->q_BN, koz_boresight_B, end_N);
     for (zone = 0; zone < KOZ_ZONES; zone++) {
         const float *axis_N = now->zone_axis_N[zone];
-        const float highest = larger(koz_dot(axis_N, start_N), koz_dot(axis_N, end_N));
-        const float half_angle = now->zone_half_angle[zone];
-        if (!(half_angle <= 0.0f) && !(highest + bulge <= cosf(half_angle))) return 0;
+        lowest = smaller(
+            lowest, margin_at(now, zone, larger(koz_dot(axis_N, start_N), koz_dot(axis_N, end_N)) + bulge));
     }
-    return 1;
+    return lowest;
 }
 
 /* Torque against the angular momentum as it stands in the middle of the step. */
@@ -206,97 +275,149 @@ static void brake(const body_state *body, float torque_B[3])
     float momentum_B[3], turned_B[3], size, strength;
     int i;
     multiply(inertia, body->omega_BN_B, momentum_B);
+    strength = smaller(brake_limit, koz_norm(momentum_B) / KOZ_STEP_SECONDS);
     koz_cross(momentum_B, body->omega_BN_B, turned_B);
     for (i = 0; i < 3; i++) momentum_B[i] += 0.5f * KOZ_STEP_SECONDS * turned_B[i];
     size = koz_norm(momentum_B);
-    strength = smaller(brake_limit, size / KOZ_STEP_SECONDS);
     for (i = 0; i < 3; i++) torque_B[i] = size > 0.0f ? -strength * momentum_B[i] / size : 0.0f;
 }
 
-static int nearest_zone(const koz_situation *now, float *margin)
+/* Torque within the box that takes up a rate. */
+static void take_up(const body_state *body, const float rate_B[3], float torque_B[3])
 {
-    float boresight_N[3], found;
-    int zone, nearest = 0;
-    koz_rotate(now->q_BN, koz_boresight_B, boresight_N);
-    *margin = koz_angle(boresight_N, now->zone_axis_N[0]) - now->zone_half_angle[0];
-    for (zone = 1; zone < KOZ_ZONES; zone++) {
-        found = koz_angle(boresight_N, now->zone_axis_N[zone]) - now->zone_half_angle[zone];
-        if (found < *margin) {
-            *margin = found;
-            nearest = zone;
-        }
-    }
-    return nearest;
-}
-
-/* Torque that leads the boresight around the nearest zone, to the side that it moves or is pushed to already. */
-static void guide(const koz_situation *now, const body_state *body, const float requested_B[3], float torque_B[3])
-{
-    const float *look_B = koz_boresight_B, *omega_B = body->omega_BN_B;
-    float to_body[4], axis_B[3], inward_B[3], aside_B[3], momentum_B[3], gyroscopic_B[3], pushed_B[3], moved_B[3];
-    float course_B[3], wanted_B[3], margin, along, size, drift, sideways, outward, largest;
-    const int nearest = nearest_zone(now, &margin);
+    float wanted_B[3], momentum_B[3], gyroscopic_B[3], largest = 0.0f;
     int i;
-    koz_conjugate(body->q_BN, to_body);
-    koz_rotate(to_body, now->zone_axis_N[nearest], axis_B);
-    along = koz_dot(axis_B, look_B);
-    for (i = 0; i < 3; i++) inward_B[i] = axis_B[i] - along * look_B[i];
-    size = koz_norm(inward_B);
-    for (i = 0; i < 3; i++) inward_B[i] = size > 0.0f ? inward_B[i] / size : 0.0f;
-    koz_cross(inward_B, look_B, aside_B);
-    multiply(inertia, omega_B, momentum_B);
-    koz_cross(omega_B, momentum_B, gyroscopic_B);
-    for (i = 0; i < 3; i++) moved_B[i] = requested_B[i] - gyroscopic_B[i];
-    multiply(inverse_inertia, moved_B, pushed_B);
-    for (i = 0; i < 3; i++) pushed_B[i] += omega_B[i];
-    koz_cross(pushed_B, look_B, moved_B);
-    drift = koz_dot(aside_B, moved_B);
-    sideways = drift >= 0.0f ? guide_rate : -guide_rate;
-    outward = larger(-guide_rate, smaller(guide_rate, 2.0f * shield_margin - margin));
-    for (i = 0; i < 3; i++) course_B[i] = sideways * aside_B[i] - outward * inward_B[i];
-    koz_cross(look_B, course_B, wanted_B);
-    for (i = 0; i < 3; i++) wanted_B[i] = (wanted_B[i] - omega_B[i]) / guide_seconds;
+    for (i = 0; i < 3; i++) wanted_B[i] = (rate_B[i] - body->omega_BN_B[i]) / guide_seconds;
     multiply(inertia, wanted_B, torque_B);
-    largest = 0.0f;
+    multiply(inertia, body->omega_BN_B, momentum_B);
+    koz_cross(body->omega_BN_B, momentum_B, gyroscopic_B);
     for (i = 0; i < 3; i++) {
         torque_B[i] += gyroscopic_B[i];
-        largest = larger(largest, fabsf(torque_B[i])@SHARE_OF_I@);
+        largest = larger(largest, fabsf(torque_B[i]) / @LIMIT_OF_I@);
     }
-    largest = larger(1.0f, largest@SHARE@);
+    largest = larger(1.0f, largest);
     for (i = 0; i < 3; i++) torque_B[i] /= largest;
 }
 
-static void body_of(const koz_situation *now, body_state *body)
+/*
+ * Torques that lead the boresight around the nearest zone and away from all near ones, and only away.  Returns the
+ * margin [rad] to the nearest.
+ */
+static float guide(
+    const koz_situation *now, const body_state *body, const float requested_B[3], float around_B[3], float away_B[3])
 {
+    float to_body[4], axis_B[3], look_N[3], out_B[3], nearest_B[3] = {0.0f, 0.0f, 0.0f}, side_B[3], rate_B[3];
+    float momentum_B[3], gyroscopic_B[3], pushed_B[3], soon_B[3], missing_B[3] = {0.0f, 0.0f, 0.0f};
+    float margin, size, missing, sideways, nearest = unbounded;
+    int zone, i;
+    koz_conjugate(body->q_BN, to_body);
+    koz_rotate(body->q_BN, koz_boresight_B, look_N);
+    for (zone = 0; zone < KOZ_ZONES; zone++) {
+        if (now->zone_half_angle[zone] <= 0.0f) continue;
+        margin = koz_angle(look_N, now->zone_axis_N[zone]) - now->zone_half_angle[zone];
+        koz_rotate(to_body, now->zone_axis_N[zone], axis_B);
+        koz_cross(axis_B, koz_boresight_B, out_B);
+        size = koz_norm(out_B);
+        missing = (2.0f * shield_margin - margin) / (guide_ahead * guide_seconds);
+        missing = larger(0.0f, smaller(guide_rate, missing));
+        for (i = 0; i < 3; i++) {
+            out_B[i] = size > 0.0f ? out_B[i] / size : 0.0f;
+            missing_B[i] += missing * out_B[i];
+            if (margin < nearest) nearest_B[i] = out_B[i];
+        }
+        nearest = smaller(nearest, margin);
+    }
+    koz_cross(nearest_B, koz_boresight_B, side_B);
+    multiply(inertia, body->omega_BN_B, momentum_B);
+    koz_cross(body->omega_BN_B, momentum_B, gyroscopic_B);
+    for (i = 0; i < 3; i++) pushed_B[i] = requested_B[i] - gyroscopic_B[i];
+    multiply(inverse_inertia, pushed_B, soon_B);
+    for (i = 0; i < 3; i++) soon_B[i] = body->omega_BN_B[i] + guide_ahead * guide_seconds * soon_B[i];
+    sideways = koz_dot(soon_B, side_B) >= 0.0f ? guide_rate : -guide_rate;
+    for (i = 0; i < 3; i++) rate_B[i] = sideways * side_B[i] + guide_tilt * guide_rate * nearest_B[i] + missing_B[i];
+    take_up(body, rate_B, around_B);
+    take_up(body, missing_B, away_B);
+    return nearest;
+}
+
+static body_state body_of(const koz_situation *now)
+{
+    body_state body;
     int i;
-    for (i = 0; i < 4; i++) body->q_BN[i] = now->q_BN[i];
-    for (i = 0; i < 3; i++) body->omega_BN_B[i] = now->omega_BN_B[i];
+    for (i = 0; i < 4; i++) body.q_BN[i] = now->q_BN[i];
+    for (i = 0; i < 3; i++) body.omega_BN_B[i] = now->omega_BN_B[i];
+    return body;
 }
 
 int koz_is_safe(const koz_situation *now)
 {
+    const koz_situation unit = koz_unit_situation(now);
+    const body_state body = body_of(&unit);
+    return koz_fault(now) == NULL && clearance(&unit, &body, 0.0f, shield_margin) >= shield_margin;
+}
+
+typedef struct {
+    const koz_situation *now;
     body_state body;
-    body_of(now, &body);
-    return is_safe(now, &body, shield_margin);
+    float present; /* [rad] clearance of braking from a slow state, where it is known well; else unbounded */
+} search;
+
+/* Lower bound of the clearance [rad] after a candidate; one below least is returned as it stands. */
+static float clearance_after(const search *at, const float torque_B[3], const body_state *after, float least)
+{
+    const float trust = inertia_error / (1.0f - inertia_error);
+    const float pushed = (trust * koz_norm(torque_B) + disturbance) * KOZ_STEP_SECONDS / smallest_moment;
+    return clearance(at->now, after, pushed, least);
+}
+
+/* Whether a candidate a share + b (1 - share) can be let through, which it then is: allowed_B. */
+static int passes(
+    const search *at, float share, const float a_B[3], const float b_B[3], float least, float allowed_B[3])
+{
+    const float slack = attitude_error + rate_error * KOZ_STEP_SECONDS;
+    body_state after;
+    int i;
+    for (i = 0; i < 3; i++) allowed_B[i] = share * a_B[i] + (1.0f - share) * b_B[i];
+    push(&at->body, allowed_B, &after);
+    if (!(clearance_after(at, allowed_B, &after, least) >= least)) return 0;
+    return at->present <= slack || step_clearance(at->now, &at->body, &after, allowed_B) >= slack;
+}
+
+static void allow(const koz_situation *now, const float requested_B[3], float allowed_B[3])
+{
+    search at;
+    body_state after;
+    float request_B[3], around_B[3], away_B[3], brake_B[3], momentum, braking, nearest, least;
+    int i;
+    at.now = now;
+    at.body = body_of(now);
+    at.present = unbounded;
+    for (i = 0; i < 3; i++) request_B[i] = larger(-@LIMIT_OF_I@, smaller(@LIMIT_OF_I@, requested_B[i]));
+    if (passes(&at, 1.0f, request_B, request_B, shield_margin, allowed_B)) return;
+
+    nearest = guide(now, &at.body, request_B, around_B, away_B);
+    brake(&at.body, brake_B);
+    push(&at.body, brake_B, &after);
+    braking = clearance_after(&at, brake_B, &after, -unbounded);
+    (void)twice_energy(&at.body, &momentum);
+    /* Inside a zone any way out is good. */
+    if (momentum <= slow_steps * brake_limit * KOZ_STEP_SECONDS || nearest <= 0.0f) at.present = braking;
+    least = smaller(0.5f * shield_margin, at.present);
+    if (braking < 0.5f * shield_margin && passes(&at, 1.0f, away_B, away_B, least, allowed_B)) return;
+    least = smaller(shield_margin, at.present + least_gain);
+    for (i = 0; i < REQUEST_SHARES; i++)
+        if (passes(&at, request_shares[i], request_B, around_B, least, allowed_B)) return;
+    least = smaller(0.5f * shield_margin, at.present);
+    for (i = 0; i < GUIDE_SHARES; i++)
+        if (passes(&at, guide_shares[i], around_B, brake_B, least, allowed_B)) return;
+    for (i = 0; i < 3; i++) allowed_B[i] = brake_B[i];
 }
 
 void koz_shield(const koz_situation *now, const float requested_B[3], float allowed_B[3])
 {
-    const float margins[CANDIDATES] = {shield_margin, shield_margin, 0.5f * shield_margin};
-    float candidates_B[CANDIDATES][3];
-    body_state body, after;
-    int i, tried;
-    body_of(now, &body);
-    for (i = 0; i < 3; i++)
-        candidates_B[0][i] = larger(-@LIMIT_OF_I@, smaller(@LIMIT_OF_I@, requested_B[i]));
-    guide(now, &body, candidates_B[0], candidates_B[2]);
-    for (i = 0; i < 3; i++) candidates_B[1][i] = 0.5f * (candidates_B[0][i] + candidates_B[2][i]);
-    for (tried = 0; tried < CANDIDATES; tried++) {
-        push(&body, candidates_B[tried], &after);
-        if (step_is_clear(now, &body, &after) && is_safe(now, &after, margins[tried])) {
-            for (i = 0; i < 3; i++) allowed_B[i] = candidates_B[tried][i];
-            return;
-        }
-    }
-    brake(&body, allowed_B);
+    const koz_situation unit = koz_unit_situation(now);
+    float found_B[3] = {0.0f, 0.0f, 0.0f};
+    int i;
+    if (koz_fault(now) == NULL) allow(&unit, requested_B, found_B);
+    for (i = 0; i < 3; i++) allowed_B[i] = found_B[i];
 }

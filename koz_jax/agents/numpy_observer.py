@@ -1,0 +1,108 @@
+"""The observation of a measured state with NumPy alone, for those who close the loop themselves; imports no jax.
+
+>>> policy = load_policy("phase2")
+>>> observer = observer_of(policy)
+>>> action = policy.predict(observer.observe(q_BN, omega_BN_B, q_DN, zones))  # once in every time step
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from koz_jax.agents.numpy_policy import NumpyPolicy
+from koz_jax.config import attitudes
+from koz_jax.task import host
+from koz_jax.task.host import Cones
+from koz_jax.task.observation_layout import ABSENT_HALF_ANGLE, layout, zone_part
+
+
+class Observer:
+    """What a policy sees of measured attitudes and rates, one call in every time step of a maneuver.
+
+    q and -q are one attitude, and star trackers and ephemerides choose the sign anew at every measurement; a policy
+    must not see it jump.  So of q_e and -q_e the one nearer to that of the step before is taken, at the start of a
+    maneuver the one with q_e0 >= 0.
+    """
+
+    def __init__(self, boresight: npt.ArrayLike = (1.0, 0.0, 0.0), observed_zones: int = 1) -> None:
+        """Begin a maneuver.
+
+        boresight: of the instrument, in body axes (3,); observed_zones: how many zones the policy sees.
+        """
+        self._boresight_B = host.unit("boresight", boresight, 3)
+        self._observed_zones = observed_zones
+        self._last_q_e: host.Floats | None = None
+
+    def reset(self) -> None:
+        """Begin another maneuver."""
+        self._last_q_e = None
+
+    def observe(
+        self, q_BN: npt.ArrayLike, omega_BN_B: npt.ArrayLike, q_DN: npt.ArrayLike, zones: Sequence[Any] = ()
+    ) -> npt.NDArray[np.float32]:
+        """See what is measured in this time step.
+
+        Args:
+            q_BN: attitude (4,), scalar first, of either sign; takes body components to inertial ones.
+            omega_BN_B: (3,) [rad/s] rate of the body relative to inertial, in body axes.
+            q_DN: target attitude (4,), of either sign.
+            zones: all there are, each (axis (3,) in inertial axes, half angle [deg]), or with the boresight of another
+                instrument as a third.
+
+        Returns:
+            The observation (16,), 5 entries more for each further zone that the policy sees.
+
+        Raises:
+            SettingsError: something is not finite or has another shape, or is no unit vector or quaternion, or no half
+                angle; what is off unit length by up to 1 % is normalised.
+
+        """
+        q_BN, q_DN = host.unit("q_BN", q_BN, 4), host.unit("q_DN", q_DN, 4)
+        omega_BN_B = host.numbers("omega_BN_B", omega_BN_B, (3,))
+        nearest = _nearest(q_BN, host.cones(zones, self._boresight_B), self._observed_zones)
+        last = self._last_q_e
+        q_e = host.attitude_error(q_BN, q_DN)
+        q_e = host.nearer(q_e, np.array([1.0, 0.0, 0.0, 0.0]) if last is None else last)
+        self._last_q_e = q_e
+        parts: dict[str, Any] = {
+            "q_e": q_e,
+            "omega_BN_B": omega_BN_B,
+            "boresight_B": nearest.boresight_B[0],
+            "q_e0_previous": [q_e[0] if last is None else last[0]],
+        }
+        for number in range(self._observed_zones):
+            zone = Cones(*(leaf[number] for leaf in nearest))
+            parts |= {zone_part(number, name): value for name, value in _zone_parts(q_BN, zone, number > 0).items()}
+        return np.concatenate([parts[name] for name in layout(self._observed_zones)]).astype(np.float32)
+
+
+def observer_of(policy: NumpyPolicy) -> Observer:
+    """The observer that a policy needs: its number of zones, and the boresight that it was trained for."""
+    record = policy.record
+    return Observer(record.task.spacecraft.boresight, record.network.observed_zones)
+
+
+def _nearest(q_BN: host.Floats, zones: Cones, count: int) -> Cones:
+    """The zones with the smallest margins, nearest first, filled up with absent ones.  Returns a stack of ``count``."""
+    order = np.argsort(host.margins(q_BN, zones), kind="stable")[:count]
+    missing = count - len(order)
+    return Cones(
+        np.concatenate([zones.boresight_B[order], np.tile(zones.boresight_B[0], (missing, 1))]),
+        np.concatenate([zones.axis_N[order], np.tile([1.0, 0.0, 0.0], (missing, 1))]),
+        np.concatenate([zones.half_angle[order], np.full(missing, ABSENT_HALF_ANGLE)]),
+    )
+
+
+def _zone_parts(q_BN: host.Floats, zone: Cones, masked: bool) -> dict[str, Any]:
+    if masked and zone.half_angle <= 0.0:
+        return {"zone_margin": [np.pi], "zone_angle": [np.pi], "zone_direction_B": np.zeros(3)}
+    angle = host.angles(q_BN, zone)
+    offset = attitudes.rotate(host.conjugate(q_BN), zone.axis_N) - zone.boresight_B
+    distance = np.linalg.norm(offset)
+    return {
+        "zone_margin": [angle - zone.half_angle],
+        "zone_angle": [angle],
+        "zone_direction_B": offset / distance if distance > 0.0 else np.zeros(3),
+    }

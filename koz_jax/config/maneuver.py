@@ -1,0 +1,197 @@
+"""Settings of one maneuver as a person writes it: spacecraft, instruments, constraints, start and target.
+
+Angles in degrees, quaternions scalar first; imports no jax.  ``config.maneuver_file`` reads such settings from TOML.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Self
+
+import numpy as np
+from pydantic import model_validator
+
+from koz_jax.config import attitudes
+from koz_jax.config.base import PositiveFloat, check_steps
+from koz_jax.config.maneuver_tables import (
+    BodyConfig,
+    ConstraintConfig,
+    ErrorsConfig,
+    InstrumentConfig,
+    PublishedConfig,
+    StartConfig,
+    Table,
+    TargetConfig,
+)
+from koz_jax.config.task import RewardConfig, TaskConfig
+
+# A maneuver lasts so many half turns unless it says otherwise, in whole tens of seconds.
+_HALF_TURNS, _WHOLE_SECONDS = 5, 10.0
+
+# Where the roll is free and the smallest rotation ends inside a constraint: rolls that are tried, and how far from
+# every constraint they must end.  The shield keeps less.
+_ROLL_STEP_DEG, _ROLL_CLEARANCE_DEG = 0.1, 0.25
+
+# Half angles below it are rather radians: pi / 2 and less.
+_RADIANS_BELOW = 1.6
+
+
+@dataclasses.dataclass(frozen=True)
+class Aim:
+    """The target attitude as it is flown to."""
+
+    attitude: tuple[float, ...]  # (4,) q_DN, of its two signs the one nearer to the start
+    roll_deg: float  # [deg] about the direction, away from the smallest rotation; 0 for a target by attitude
+
+
+class ManeuverConfig(Table):
+    """One maneuver: what flies, from where, to where, and what must not be looked at."""
+
+    name: str = "maneuver"
+    """What to call it."""
+    step_seconds: PositiveFloat
+    """Time step; the torque is held over it [s]."""
+    duration_seconds: PositiveFloat | None = None
+    """How long it is flown [s]; by default five times the fastest half turn about the slowest axis, in whole tens."""
+    settled_angle_deg: PositiveFloat = RewardConfig().settled_angle_deg
+    """Settled is what stays within this angle of the target [deg]."""
+    source: str = ""
+    """Where the numbers come from."""
+    published: PublishedConfig | None = None
+    """What others report."""
+    spacecraft: BodyConfig
+    """What turns."""
+    instruments: tuple[InstrumentConfig, ...] = ()
+    """What looks."""
+    constraints: tuple[ConstraintConfig, ...] = ()
+    """What must not be looked at."""
+    start: StartConfig
+    """Where it starts."""
+    target: TargetConfig
+    """Where it must end."""
+    errors: ErrorsConfig = ErrorsConfig()
+    """What the controller does not know."""
+
+    @model_validator(mode="after")
+    def _instruments_known(self) -> Self:
+        names = [instrument.name for instrument in self.instruments]
+        if len(set(names)) < len(names):
+            raise ValueError(f"instruments: must have different names, got {', '.join(names)}")
+        asked = [(f"constraints.{i}", constraint.instrument) for i, constraint in enumerate(self.constraints)]
+        for where, name in [*asked, ("target", self.target.instrument)]:
+            if name is not None and name not in names:
+                known = ", ".join(names) or "none: there is no [[instruments]]"
+                raise ValueError(f"{where}.instrument: must be one of the instruments ({known}), got {name!r}")
+        return self
+
+    @model_validator(mode="after")
+    def _step_of_the_spacecraft(self) -> Self:
+        quickest = self.spacecraft.half_turns[1]
+        if self.step_seconds > 0.5 * quickest:
+            raise ValueError(
+                f"step_seconds: must be at most {0.5 * quickest:.3g}, half of the {quickest:.3g} s in which this"
+                f" spacecraft can make a half turn; got {self.step_seconds:g}. Are inertia and torque_limit in kg m2"
+                " and N m?"
+            )
+        check_steps("duration_seconds", self.seconds, self.step_seconds)
+        return self
+
+    @model_validator(mode="after")
+    def _clear_at_both_ends(self) -> Self:
+        self._check_clear("start.attitude", self.start.attitude)
+        self._check_clear("target.attitude" if self.target.attitude else "target.direction", self.aim.attitude)
+        return self
+
+    def _check_clear(self, where: str, attitude: tuple[float, ...]) -> None:
+        margins = self.margins_deg(np.array(attitude))
+        if len(margins) and margins.min() <= 0.0:
+            number = int(margins.argmin())
+            constraint = self.constraints[number]
+            written = ", ".join(f"{value:.6g}" for value in attitude)
+            raise ValueError(
+                f"{where}: must keep every instrument outside its cones; ({written}) has {constraint.instrument!r}"
+                f" {-margins.min():.3g} deg inside constraints.{number}, of half angle"
+                f" {constraint.half_angle_deg:g} deg"
+            )
+
+    def boresight(self, instrument: str) -> np.ndarray:
+        """Where an instrument looks.  Returns (3,) unit vector in body axes."""
+        return np.array(next(found.boresight for found in self.instruments if found.name == instrument))
+
+    def margins_deg(self, attitude: np.ndarray) -> np.ndarray:
+        """Margin to each constraint.  attitude: (..., 4).  Returns (..., constraints) [deg]."""
+        if not self.constraints:
+            return np.zeros((*attitude.shape[:-1], 0))
+        angles = [
+            attitudes.angle_between(attitudes.rotate(attitude, self.boresight(one.instrument)), np.array(one.direction))
+            for one in self.constraints
+        ]
+        return np.rad2deg(np.stack(angles, axis=-1)) - [one.half_angle_deg for one in self.constraints]
+
+    @property
+    def aim(self) -> Aim:
+        """The target attitude.
+
+        For a target by direction the one that the smallest rotation from the start leads to; if that ends inside a
+        constraint, the nearest roll about the direction that does not.
+        """
+        start = np.array(self.start.attitude)
+        if self.target.attitude is not None:
+            return _nearer(np.array(self.target.attitude), start, 0.0)
+        assert self.target.instrument is not None and self.target.direction is not None
+        direction = np.array(self.target.direction)
+        looks = attitudes.rotate(start, self.boresight(self.target.instrument))
+        straight = attitudes.multiply(attitudes.shortest_arc(looks, direction), start)
+        if np.all(self.margins_deg(straight) > 0.0):
+            return _nearer(straight, start, 0.0)
+        count = round(180.0 / _ROLL_STEP_DEG)
+        rolls_deg = _ROLL_STEP_DEG * np.arange(1, count + 1)
+        rolls_deg = np.stack([rolls_deg, -rolls_deg], axis=1).ravel()
+        rolled = attitudes.multiply(attitudes.turn_about(direction, np.deg2rad(rolls_deg)), straight)
+        clear = self.margins_deg(rolled).min(axis=1)
+        found = int(np.argmax(clear >= _ROLL_CLEARANCE_DEG)) if clear.max() >= _ROLL_CLEARANCE_DEG else None
+        if found is None:
+            raise ValueError(
+                f"target.direction: no roll about it keeps every instrument {_ROLL_CLEARANCE_DEG:g} deg outside its"
+                f" cones; the best leaves {clear.max():.3g} deg, got {self.target.direction}"
+            )
+        return _nearer(rolled[found], start, float(rolls_deg[found]))
+
+    @property
+    def has_errors(self) -> bool:
+        """Whether there is anything that the controller does not know."""
+        return self.errors != ErrorsConfig()
+
+    @property
+    def seconds(self) -> float:
+        """How long it is flown [s]."""
+        if self.duration_seconds is not None:
+            return self.duration_seconds
+        return float(_WHOLE_SECONDS * np.ceil(_HALF_TURNS * self.spacecraft.half_turns[0] / _WHOLE_SECONDS))
+
+    @property
+    def task(self) -> TaskConfig:
+        """What is flown, as settings of a task; its instrument is that of the first constraint."""
+        named = [one.instrument for one in self.constraints] or [one.name for one in self.instruments]
+        x, y, z = self.boresight(named[0]).tolist() if named else (1.0, 0.0, 0.0)
+        return TaskConfig(
+            spacecraft=self.spacecraft.spacecraft((x, y, z)),
+            reward=RewardConfig(settled_angle_deg=self.settled_angle_deg),
+            step_seconds=self.step_seconds,
+            episode_seconds=self.seconds,
+        )
+
+    @property
+    def cautions(self) -> list[str]:
+        """What is allowed and looks wrong, each in a line."""
+        return [
+            f"constraints.{i}.half_angle_deg: {one.half_angle_deg:g} deg is small; is it {one.half_angle_deg:g} rad ="
+            f" {np.rad2deg(one.half_angle_deg):.1f} deg?"
+            for i, one in enumerate(self.constraints)
+            if one.half_angle_deg < _RADIANS_BELOW
+        ]
+
+
+def _nearer(attitude: np.ndarray, start: np.ndarray, roll_deg: float) -> Aim:
+    """Of the two signs of an attitude, the one that is nearer to the start."""
+    return Aim(tuple((attitude if attitude @ start >= 0.0 else -attitude).tolist()), roll_deg)

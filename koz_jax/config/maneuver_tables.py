@@ -1,0 +1,209 @@
+"""The tables of a maneuver file.  Angles in degrees, quaternions scalar first; imports no jax."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import AfterValidator, BeforeValidator, ValidationError, model_validator
+
+from koz_jax.config import attitudes
+from koz_jax.config.base import (
+    HalfAngleDeg,
+    NonNegativeFloat,
+    PositiveFloat,
+    Settings,
+    ShareBelowOne,
+    Vector,
+)
+from koz_jax.config.shield import UncertaintyConfig
+from koz_jax.config.task import SpacecraftConfig, TorqueLimit
+from koz_jax.errors import explain
+
+# By so much a direction or a quaternion may be longer or shorter than 1; more is a slip of the pen.
+_LENGTH_TOLERANCE = 0.01
+
+# A half turn that takes longer is a mistake of units, such as moments in g cm2 or kg mm2.
+_LONGEST_HALF_TURN_SECONDS = 3600.0
+
+
+def _of_unit_length(values: tuple[float, ...]) -> tuple[float, ...]:
+    length = float(np.linalg.norm(values))
+    if abs(length - 1.0) > _LENGTH_TOLERANCE:
+        kind = "a unit quaternion, scalar first" if len(values) == 4 else "a unit vector"
+        raise ValueError(f"must be {kind}, of length 1 to within {_LENGTH_TOLERANCE:.0%}; its length is {length:.6g}")
+    return tuple(attitudes.normalized(values).tolist())
+
+
+def _not_yet(allowed: str) -> BeforeValidator:
+    """Refuse what the format has and this version cannot fly."""
+
+    def refuse(value: Any) -> Any:
+        if value is not None:
+            raise ValueError(f"not supported yet; {allowed}")
+        return value
+
+    return BeforeValidator(refuse)
+
+
+def _only_zero(allowed: str) -> AfterValidator:
+    def refuse(value: Any) -> Any:
+        if np.any(np.asarray(value) != 0):
+            raise ValueError(f"not supported yet; {allowed}")
+        return value
+
+    return AfterValidator(refuse)
+
+
+def _keep_out_only(kind: Any) -> Any:
+    if kind == "keep_in":
+        raise ValueError("not supported yet; allowed is 'keep_out'")
+    return kind
+
+
+Direction = Annotated[Vector, AfterValidator(_of_unit_length)]
+Attitude = Annotated[tuple[float, float, float, float], AfterValidator(_of_unit_length)]
+
+
+class Table(Settings):
+    """A table of a maneuver file; says which keys there are where one is unknown."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys(cls, given: Any) -> Any:
+        unknown = [key for key in given if key not in cls.model_fields] if isinstance(given, dict) else []
+        if unknown:
+            values = ", ".join(f"{key!r} (got {given[key]!r})" for key in unknown)
+            raise ValueError(f"unknown key {values}; allowed are {', '.join(cls.model_fields)}")
+        return given
+
+
+class BodyConfig(Table):
+    """The spacecraft's body and actuators."""
+
+    inertia: tuple[Vector, Vector, Vector]
+    """Inertia tensor in body axes, row by row [kg m^2]."""
+    torque_limit: TorqueLimit
+    """Largest torque about each body axis [N m]: one number for all, or one for each."""
+    wheels: Annotated[None, _not_yet("allowed is torque_limit [N m], one number or three")] = None
+    """Reaction wheels: not supported yet."""
+    max_rate_deg: Annotated[None, _not_yet("allowed is to leave it out: the rate is not limited")] = None
+    """Largest body rate [deg/s]: not supported yet."""
+
+    @model_validator(mode="after")
+    def _physical(self) -> Self:
+        try:
+            self.spacecraft((1.0, 0.0, 0.0))
+        except ValidationError as error:
+            raise ValueError(explain(error)) from None
+        slowest = self.half_turns[0]
+        if slowest > _LONGEST_HALF_TURN_SECONDS:
+            raise ValueError(
+                f"inertia: moments of up to {np.max(np.diag(self.inertia)):.6g} kg m2 on a torque_limit of"
+                f" {min(self.spacecraft((1.0, 0.0, 0.0)).torque_limits):.6g} N m make a half turn take"
+                f" {slowest / 3600.0:.3g} h; allowed is at most 1 h. Are the moments in g cm2 or kg mm2?"
+            )
+        return self
+
+    def spacecraft(self, boresight: Vector) -> SpacecraftConfig:
+        """The same with an instrument.  boresight: unit vector in body axes."""
+        return SpacecraftConfig(inertia=self.inertia, boresight=boresight, torque_limit=self.torque_limit)
+
+    @property
+    def half_turns(self) -> tuple[float, float]:
+        """The fastest half turn, 2 sqrt(pi J / u) [s], about the slowest body axis and about the quickest."""
+        limits = np.array(self.spacecraft((1.0, 0.0, 0.0)).torque_limits)
+        seconds = 2.0 * np.sqrt(np.pi * np.diag(self.inertia) / limits)
+        return float(seconds.max()), float(seconds.min())
+
+
+class InstrumentConfig(Table):
+    """Something that looks in a direction."""
+
+    name: str
+    """What constraints and targets call it."""
+    boresight: Direction
+    """Where it looks, in body axes; normalised on reading."""
+
+
+class ConstraintConfig(Table):
+    """A cone of directions that an instrument must not look into."""
+
+    instrument: str
+    """Its name."""
+    kind: Annotated[Literal["keep_out"], BeforeValidator(_keep_out_only)] = "keep_out"
+    """The instrument is kept out of the cone; keep_in is not supported yet."""
+    direction: Direction
+    """Axis of the cone, in inertial axes; normalised on reading."""
+    half_angle_deg: HalfAngleDeg
+    """Half angle of the cone [deg]."""
+    rotation_deg: Annotated[Vector, _only_zero("allowed is [0, 0, 0]: directions are fixed")] = (0.0, 0.0, 0.0)
+    """Angular velocity of the direction [deg/s]: not supported yet unless zero."""
+
+
+class StartConfig(Table):
+    """Where the maneuver starts."""
+
+    attitude: Attitude
+    """Body relative to inertial axes, scalar first."""
+    rate_deg: Vector = (0.0, 0.0, 0.0)
+    """Body rate in body axes [deg/s]."""
+
+
+class TargetConfig(Table):
+    """Where it must end: an attitude, or where an instrument looks while the roll about that is free."""
+
+    attitude: Attitude | None = None
+    """Body relative to inertial axes, scalar first; of the two signs the nearer one is taken."""
+    instrument: str | None = None
+    """Name of the instrument that must look in a direction."""
+    direction: Direction | None = None
+    """That direction, in inertial axes; normalised on reading."""
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> Self:
+        pointed = (self.instrument is not None, self.direction is not None)
+        if pointed[0] != pointed[1] or (self.attitude is not None) == pointed[0]:
+            given = ", ".join(name for name, value in self if value is not None) or "neither"
+            raise ValueError(f"must have either attitude, or instrument and direction; got {given}")
+        return self
+
+
+class ErrorsConfig(Table):
+    """What the truth has and the controller does not know."""
+
+    inertia: ShareBelowOne = 0.0
+    """Largest relative error of the inertia about any axis."""
+    disturbance_torque: NonNegativeFloat = 0.0
+    """Norm of a constant torque from outside [N m]."""
+    attitude_noise_deg: NonNegativeFloat = 0.0
+    """Standard deviation per axis of the measured attitude [deg]."""
+    rate_noise_deg: NonNegativeFloat = 0.0
+    """Standard deviation per axis of the measured rate [deg/s]."""
+    delay_steps: Annotated[int, _only_zero("allowed is 0")] = 0
+    """Steps between measurement and torque: not supported yet unless zero."""
+
+    @property
+    def uncertainty(self) -> UncertaintyConfig:
+        """The same as settings of a flight."""
+        values = self.model_dump(exclude={"inertia", "delay_steps"})
+        return UncertaintyConfig(inertia_error=self.inertia, **values)
+
+
+class PublishedConfig(Table):
+    """What others report of the same maneuver, to stand beside one's own result."""
+
+    by: str = ""
+    """Who, and how."""
+    slew_deg: PositiveFloat | None = None
+    """Rotation from start to target [deg]."""
+    settling_seconds: PositiveFloat | None = None
+    """Settling time, or length of the maneuver [s]."""
+    control_effort: NonNegativeFloat | None = None
+    """Integral of the squared torque [N^2 m^2 s]."""
+    end_error_deg: NonNegativeFloat | None = None
+    """Rotation left at the end [deg]."""
+    min_margin_deg: float | None = None
+    """Smallest margin to any constraint [deg]."""
+    peak_rate_deg: NonNegativeFloat | None = None
+    """Largest norm of the body rate [deg/s]."""

@@ -1,0 +1,110 @@
+"""Whether the numbers of a task fit together: wrong units are told before anything is computed.  Imports no jax."""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from koz_jax.config.task import SpacecraftConfig, TaskConfig
+from koz_jax.errors import SettingsError
+
+# [rad] Turn within a single step, from rest by full torque, above which a held torque can no longer steer.
+MAX_TURN_PER_STEP = 1.0
+
+_log = logging.getLogger(__name__)
+
+
+class Finding(NamedTuple):
+    """Something that is wrong with a task."""
+
+    text: str  # names the setting and the number
+    hopeless: bool  # nothing can be learned; otherwise it is only suspicious
+
+
+class Agility(NamedTuple):
+    """How fast a body can turn about one of its principal axes."""
+
+    moment: float  # [kg m^2]
+    torque: float  # [N m]
+
+    @property
+    def acceleration(self) -> float:
+        """Largest angular acceleration [rad/s^2]."""
+        return self.torque / self.moment
+
+    def turn_seconds(self, angle_deg: float) -> float:
+        """Least time [s] of a turn by an angle from rest to rest: 2 sqrt(pi J / u) for 180 deg."""
+        return 2.0 * math.sqrt(math.radians(angle_deg) / self.acceleration)
+
+    def __str__(self) -> str:
+        return f"{self.moment:.3g} kg m^2, {self.torque:.3g} N m"
+
+
+def agilities(spacecraft: SpacecraftConfig) -> list[Agility]:
+    """Agility about each principal axis, the slowest first."""
+    moments, axes_B = np.linalg.eigh(np.array(spacecraft.inertia))
+    shares = np.maximum(np.abs(axes_B), 1e-12) / np.array(spacecraft.torque_limits)[:, None]
+    torques = 1.0 / shares.max(axis=0)  # the longest torque along the axis that is in the box
+    found = [Agility(float(moment), float(torque)) for moment, torque in zip(moments, torques, strict=True)]
+    return sorted(found, key=lambda agility: agility.acceleration)
+
+
+def findings(task: TaskConfig, min_angle_deg: float, max_angle_deg: float) -> list[Finding]:
+    """Find what cannot be, or can hardly be meant.  min_angle_deg, max_angle_deg: initial deviations that are drawn."""
+    slowest, *_, quickest = agilities(task.spacecraft)
+    found = []
+    for agility, angle_deg, hopeless in ((quickest, min_angle_deg, True), (slowest, max_angle_deg, False)):
+        least = agility.turn_seconds(angle_deg)
+        if least > task.episode_seconds:
+            found.append(
+                Finding(
+                    f"task.spacecraft: a turn by {angle_deg:g} deg takes {least:.3g} s or more ({agility}), and"
+                    f" episode_seconds is {task.episode_seconds:g}; are the units kg m^2 and N m?",
+                    hopeless,
+                )
+            )
+            break
+    per_step = quickest.acceleration * task.step_seconds**2
+    if per_step > MAX_TURN_PER_STEP:
+        found.append(
+            Finding(
+                f"task.spacecraft: full torque over one step of {task.step_seconds:g} s gives a turn of {per_step:.3g}"
+                f" rad a step ({quickest}), too much to steer; are the units kg m^2 and N m? A shorter step_seconds"
+                " helps",
+                False,
+            )
+        )
+    return [*found, *_undrawn(task, max_angle_deg)]
+
+
+def _undrawn(task: TaskConfig, max_angle_deg: float) -> list[Finding]:
+    """Half angles that are asked for and cannot be drawn: the zone is between start and target, and holds neither."""
+    asked, separation = task.scenario.max_half_angle_deg, task.scenario.separation_deg
+    largest = 0.5 * max_angle_deg - separation
+    if asked <= largest:
+        return []
+    return [
+        Finding(
+            f"task.scenario.max_half_angle_deg: is never drawn above {max(largest, 0.0):g} deg, since a zone keeps"
+            f" {separation:g} deg from start and target, which are at most {max_angle_deg:g} deg apart; got {asked:g}",
+            asked > 90.0 - separation,
+        )
+    ]
+
+
+def check(task: TaskConfig, min_angle_deg: float, max_angle_deg: float) -> None:
+    """Refuse a task of which nothing can be learned, and warn of what is suspicious.
+
+    Raises:
+        SettingsError: it is hopeless; the message has the number.
+
+    """
+    found = findings(task, min_angle_deg, max_angle_deg)
+    hopeless = [finding.text for finding in found if finding.hopeless]
+    if hopeless:
+        raise SettingsError("\n".join(hopeless))
+    for finding in found:
+        _log.warning("%s", finding.text)

@@ -1,0 +1,157 @@
+"""The shield: lets a torque through only if the spacecraft can still come to rest outside all zones afterwards.
+
+``docs/shield.md`` states and proves what it guarantees.  In short: braking against the angular momentum lets the
+boresight trace the path of torque-free motion, so that a whole brake maneuver is checked with a few samples of free
+motion (``brake_path``).  A request passes if the state after it has a brake path that keeps the margin.  Otherwise the
+largest share of it that passes is let through, mixed with a guide that leads around the zone (``guide``); otherwise the
+guide; otherwise the shield brakes, along a path that was found to be clear.
+"""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from koz_jax.config.shield import ShieldConfig
+from koz_jax.control.shield import brake_path, guide
+from koz_jax.control.shield.brake_path import Brake
+from koz_jax.control.shield.guide import Guide
+from koz_jax.task import dynamics, pointing_constraints, rotations
+from koz_jax.task.actuators import TorqueLimits
+from koz_jax.task.dynamics import RigidBodyState
+from koz_jax.task.environment import Reorientation
+from koz_jax.task.pointing_constraints import PointingConstraint
+from koz_jax.task.state import EnvState, Model, torque_limits
+from koz_jax.task.uncertainty import NOISE_BOUND
+
+# Shares of the request in a mix with the guide, and of the guide in a mix with the brake, that are tried in this order.
+REQUEST_SHARES = (1.0, 0.5, 0.25, 0.125)
+GUIDE_SHARES = (1.0, 0.5, 0.25, 0.125)
+
+# A state is as good as at rest where the brake has so few steps to go; its clearance is then exact.
+SLOW_STEPS = 2.0
+
+# [rad] By so much more clearance a request raises it.
+RAISE = 1e-6
+
+# Places in the search: the request, and the brake, whose clearance is found there for the others to be compared with.
+_REQUEST, _BRAKE, _AWAY, _ASKED = 0, 1, 2, 3
+
+
+class Shield(struct.PyTreeNode):
+    """A shield made for one spacecraft; traced but for the number of samples.  See ``from_config``."""
+
+    margin: jax.Array  # () [rad] kept from every zone
+    attitude_error: jax.Array  # () [rad] largest error of a measured attitude
+    brake: Brake
+    guide: Guide
+
+    def covers(self, state: EnvState, model: Model) -> jax.Array:
+        """Whether the guarantee holds from this state on: braking keeps the margin.  Returns () bool."""
+        return is_safe(self, state.body, state.scenario.constraints, model)
+
+    def allow(self, measured: EnvState, action: jax.Array, model: Model) -> jax.Array:
+        """Action (3,) in [-1, 1] that is let through in place of the requested one (3,) in [-1, 1]."""
+        limits = torque_limits(measured, model)
+        torque_B = limits.box_B * action
+        allowed_B = self.filter(measured.body, torque_B, measured.scenario.constraints, limits, model)
+        # What passes comes back to the last bit, also where the limit is no power of two.
+        return jnp.where(jnp.all(allowed_B == torque_B), action, allowed_B / limits.box_B)
+
+    def filter(
+        self,
+        body: RigidBodyState,
+        torque_B: jax.Array,
+        constraints: PointingConstraint,
+        limits: TorqueLimits,
+        model: Model,
+    ) -> jax.Array:
+        """Return the torque (3,) [N m] that is let through in place of the requested one, within the same box.
+
+        torque_B: (3,) [N m], each component within its limit; constraints: stacked along a leading axis.
+        """
+        situation = brake_path.situation(constraints, model)
+        brake_B = brake_path.torque(self.brake, body, model)
+        guide_B, away_B = guide.torques(self.guide, self.margin, body, torque_B, constraints, limits, model)
+        asked_B = [share * torque_B + (1.0 - share) * guide_B for share in REQUEST_SHARES]
+        led_B = [share * guide_B + (1.0 - share) * brake_B for share in GUIDE_SHARES]
+        tried_B = jnp.stack([torque_B, brake_B, away_B, *asked_B, *led_B, brake_B])
+        last = len(tried_B) - 1
+        # In between the steps nothing may be entered; what is measured may be wrong.
+        slack = self.attitude_error + self.brake.rate_error * model.dt
+        momentum = rotations.norm(dynamics.matvec(model.inertia_B, body.omega_BN_B))
+        slow = momentum <= SLOW_STEPS * self.brake.torque * model.dt
+        inside_now = pointing_constraints.smallest_margin(body.q_BN, constraints) <= 0.0
+
+        def attempt(search: _Search) -> _Search:
+            number, candidate_B = search.number, tried_B[search.number]
+            after = dynamics.step(body, candidate_B, model.inertia_B, model.dt)
+            inside = brake_path.step_clearance(self.brake, body, after, candidate_B, situation, model)
+            # Of a slow state the clearance is known well, so what is no worse than braking will do where there is less
+            # than there should be; of a fast one it is a bound that may have been better before.  Inside a zone any way
+            # out is good.
+            present = jnp.where(slow | inside_now, search.braking, jnp.inf)
+            least = jnp.where(
+                number < _ASKED + len(asked_B),
+                jnp.minimum(self.margin, present + RAISE),
+                jnp.minimum(0.5 * self.margin, present),
+            )
+            least = jnp.where(number == _REQUEST, self.margin, least)
+            pushed = brake_path.push_error(self.brake, candidate_B, model.dt)
+            needed = jnp.where(number == _BRAKE, -jnp.inf, least)
+            found = brake_path.clearance(self.brake, after, pushed, situation, model, self.margin, needed)
+            made = (found >= least) & ((inside >= slack) | (present <= slack)) & (number != _BRAKE)
+            # Only away from the zone where there is too little; else a craft at rest would stay where it is.
+            made = made & ((number != _AWAY) | (search.braking < 0.5 * self.margin))
+            braking = jnp.where(number == _BRAKE, found, search.braking)
+            return _Search(jnp.where(made, number, number + 1), made, braking)
+
+        # A loop, not a branch: a batch then computes no more than its most critical case needs.
+        begin = _Search(jnp.int32(_REQUEST), jnp.array(False), jnp.float32(jnp.inf))
+        end = jax.lax.while_loop(lambda search: ~search.made & (search.number < last), attempt, begin)
+        return tried_B[end.number]
+
+
+class _Search(struct.PyTreeNode):
+    """For the first candidate that can be let through."""
+
+    number: jax.Array  # () int32 of the candidate
+    made: jax.Array  # () bool, it can
+    braking: jax.Array  # () [rad] clearance after a step of the brake; inf until it is known
+
+
+def from_config(config: ShieldConfig, model: Model) -> Shield:
+    """Make a shield for a spacecraft, with a margin for the errors that ``config`` has to withstand."""
+    errors = config.error_bounds
+    limits = model.actuators.limits(model.actuators.initial_state())
+    attitude_error, rate_error = (
+        NOISE_BOUND * jnp.sqrt(3.0) * jnp.deg2rad(jnp.float32(deviation))
+        for deviation in (errors.attitude_noise_deg, errors.rate_noise_deg)
+    )
+    moments = jnp.linalg.eigvalsh(model.inertia_B)
+    brake = Brake(
+        torque=limits.every_direction - errors.disturbance_torque,
+        inertia_error=jnp.float32(errors.inertia_error),
+        disturbance=jnp.float32(errors.disturbance_torque),
+        rate_error=rate_error,
+        smallest_moment=moments[0],
+        largest_moment=moments[2],
+        samples=config.samples,
+    )
+    return Shield(
+        margin=jnp.deg2rad(jnp.float32(config.margin_deg)) + 2.0 * attitude_error,
+        attitude_error=attitude_error,
+        brake=brake,
+        guide=guide.from_config(config, brake, limits, model),
+    )
+
+
+def is_safe(shield: Shield, body: RigidBodyState, constraints: PointingConstraint, model: Model) -> jax.Array:
+    """Whether braking from here keeps the margin to all zones.  Returns () bool."""
+    situation = brake_path.situation(constraints, model)
+    found = brake_path.clearance(shield.brake, body, jnp.zeros(()), situation, model, shield.margin, shield.margin)
+    return found >= shield.margin
+
+
+def under_shield(env: Reorientation, config: ShieldConfig | None) -> Reorientation:
+    """Put a shield between controllers and actuators of an environment; None leaves it as it is."""
+    return env if config is None else env.replace(action_filter=from_config(config, env.model))

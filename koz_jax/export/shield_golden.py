@@ -1,0 +1,152 @@
+"""Golden vectors of the shield: what it makes of requests everywhere, at a zone's edge, and inside a zone."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from koz_jax.agents.agent import Agent
+from koz_jax.config.shield import ShieldConfig
+from koz_jax.control.shield import filter as shield
+from koz_jax.control.shield.filter import Shield
+from koz_jax.export.golden import Situation, directions, known, rows, situations
+from koz_jax.task import rotations, state
+from koz_jax.task.state import Model
+
+# Kinds of situations that are drawn in turn: as for the policy, slow at the edge of a zone, and slow inside it.
+_EVERYWHERE, _EDGE, _INSIDE = 0, 1, 2
+_KINDS = (_EVERYWHERE, _EDGE, _EVERYWHERE, _INSIDE)
+_EDGE_MARGINS = (-0.5, 4.0)  # where "at the edge" is, in margins of the shield
+_DEEPEST = 0.9  # share of the half angle
+_SLOWEST, _FASTEST = 1e-3, 4.0  # momentum in steps of the brake
+
+_DRAWN_PER_VECTOR = 20  # few requests are refused
+
+# What rounding changes is far smaller, and what these change in a torque that is decided alike is below the last.
+_MARGIN_SHIFT = 2e-5  # [rad]
+_TURN = 1e-5  # [rad]
+_RATE_SHIFT = 1e-4  # relative
+_INERTIA_SHIFT = 2e-2  # moves the clearance after a torque beside that after the brake
+_ROUNDINGS = 50
+_STEADY = 1e-2  # of the torque limit: another candidate is farther away
+
+
+class ShieldGolden(NamedTuple):
+    """Situations and what the shield makes of them, none close to a threshold; leading axis (count,)."""
+
+    situation: np.ndarray  # (count, 11 + 4 zones) float32
+    requested: np.ndarray  # (count, 3) float32 [N m]
+    allowed: np.ndarray  # (count, 3) float32 [N m]
+    safe: np.ndarray  # (count,) bool, whether the situation itself is safe
+
+
+class _Variant(struct.PyTreeNode):
+    """A situation told a little differently, or to a shield that is a little different."""
+
+    margin: float = 0.0  # [rad] added to the shield's
+    rate: float = 0.0  # relative, added to all rates
+    turn: float = 0.0  # [rad] of the attitude
+    inertia_error: float = 0.0  # added to the one that the shield withstands
+
+
+def _variants() -> list[_Variant]:
+    """Each way of being different alone, then many that only round differently; the first is not different."""
+    rng = np.random.default_rng(0)
+    shifts = {"margin": _MARGIN_SHIFT, "rate": _RATE_SHIFT, "turn": _TURN, "inertia_error": _INERTIA_SHIFT}
+    alone = [_Variant(**{name: sign * shift}) for name, shift in shifts.items() for sign in (-1.0, 1.0)]
+    drawn = rng.uniform(-1.0, 1.0, (_ROUNDINGS, 2)) * (_RATE_SHIFT, _TURN)
+    return [_Variant(), *alone, *(_Variant(rate=float(rate), turn=float(turn)) for rate, turn in drawn)]
+
+
+def shield_golden(agent: Agent, config: ShieldConfig, count: int, seed: int = 0) -> ShieldGolden:
+    """Draw situations and requests; of every kind, passed and not, about as many, as far as there are.
+
+    Where other roundings could decide otherwise, as they do with a margin, a rate or an attitude that is a little
+    different, none is kept.
+
+    Raises:
+        SettingsError: there is no torque for what the shield is to withstand.
+
+    """
+    limits = agent.task.spacecraft.torque_limits
+    config.check(limits)
+    model, boresight_B = known(agent)
+    made = shield.from_config(config, model)
+    drawn, kind = shield_situations(agent, config, _DRAWN_PER_VECTOR * count, seed)
+    box = np.random.default_rng(seed).uniform(np.negative(limits), limits, (_DRAWN_PER_VECTOR * count, 3))
+    requested = box.astype(np.float32)
+    answers = [_answer(made, drawn, requested, model, boresight_B, variant) for variant in _variants()]
+    allowed, safe = (np.stack(answer) for answer in zip(*answers, strict=True))
+    steady = np.all(np.ptp(allowed, axis=0) < _STEADY * np.array(limits), axis=1) & (safe[0] == safe).all(axis=0)
+    passed = np.all(allowed == requested, axis=2)
+    steady &= (passed[0] == passed).all(axis=0)
+    kept = _in_turn(np.flatnonzero(steady), 2 * kind + passed[0])[:count]
+    return ShieldGolden(rows(drawn)[kept], requested[kept], allowed[0][kept], safe[0][kept])
+
+
+def shield_situations(agent: Agent, config: ShieldConfig, count: int, seed: int = 0) -> tuple[Situation, np.ndarray]:
+    """Draw situations of all kinds.  Returns leaves (count, ...), and the kinds (count,).
+
+    Those at an edge or inside have the nearest zone moved there, and rates of the order that the brake takes up in a
+    step.
+    """
+    rng = np.random.default_rng(seed)
+    drawn = situations(agent, count, seed)
+    model, boresight_B = known(agent)
+    made = shield.from_config(config, model)
+    kind = np.resize(_KINDS, count)
+    half_angle = np.asarray(drawn.zone_half_angle[:, 0])
+    margin = np.where(
+        kind == _EDGE,
+        float(made.margin) * rng.uniform(*_EDGE_MARGINS, count),
+        -half_angle * rng.uniform(0.0, _DEEPEST, count),
+    )
+    look_N = jax.vmap(rotations.rotate, in_axes=(0, None))(drawn.q_BN, boresight_B)
+    side_N = jax.vmap(rotations.cross)(look_N, directions(rng, count, 3))
+    side_N = side_N / jnp.linalg.norm(side_N, axis=1, keepdims=True)
+    tilt = jax.vmap(rotations.from_axis_angle)(side_N, jnp.float32(half_angle + margin))
+    axis_N = jax.vmap(rotations.rotate)(tilt, look_N)
+    steps = _SLOWEST * (_FASTEST / _SLOWEST) ** rng.uniform(size=(count, 1))
+    rate = steps * float(made.brake.torque * model.dt / made.brake.largest_moment)
+    moved = jnp.asarray(kind != _EVERYWHERE)
+    return drawn.replace(
+        omega_BN_B=jnp.where(moved[:, None], jnp.float32(rate * directions(rng, count, 3)), drawn.omega_BN_B),
+        zone_axis_N=drawn.zone_axis_N.at[:, 0].set(jnp.where(moved[:, None], axis_N, drawn.zone_axis_N[:, 0])),
+    ), kind
+
+
+def _in_turn(chosen: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Sort indices so that one of every group comes after the other, as long as there are any."""
+    place = np.zeros(len(chosen), int)
+    for which in np.unique(group[chosen]):
+        members = group[chosen] == which
+        place[members] = np.arange(np.sum(members))
+    return chosen[np.lexsort((group[chosen], place))]
+
+
+@jax.jit
+def _answer(
+    made: Shield,
+    drawn: Situation,
+    requested: jax.Array,
+    model: Model,
+    boresight_B: jax.Array,
+    variant: _Variant,
+) -> tuple[jax.Array, jax.Array]:
+    brake = made.brake.replace(inertia_error=made.brake.inertia_error + variant.inertia_error)
+    made = made.replace(margin=made.margin + variant.margin, brake=brake)
+
+    def one(situation: Situation, torque_B: jax.Array) -> tuple[jax.Array, jax.Array]:
+        turned = rotations.from_axis_angle(jnp.array([0.6, 0.0, 0.8]), jnp.float32(variant.turn))
+        told = situation.replace(
+            q_BN=rotations.multiply(turned, situation.q_BN),
+            omega_BN_B=(1.0 + variant.rate) * situation.omega_BN_B,
+        )
+        at = told.state(model, boresight_B)
+        zones = at.scenario.constraints
+        allowed_B = made.filter(at.body, torque_B, zones, state.torque_limits(at, model), model)
+        return allowed_B, shield.is_safe(made, at.body, zones, model)
+
+    return jax.vmap(one)(drawn, requested)
