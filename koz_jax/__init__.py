@@ -9,8 +9,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from koz_jax.agents.agent import Agent as Agent
     from koz_jax.agents.agent import load_agent as load_agent
+    from koz_jax.agents.flight import fly as fly
     from koz_jax.agents.numpy_policy import load_policy as load_policy
     from koz_jax.agents.record import shipped_agents as shipped_agents
+    from koz_jax.config.maneuver import ManeuverConfig as ManeuverConfig
+    from koz_jax.config.maneuver_file import load_maneuver as load_maneuver
     from koz_jax.config.monte_carlo import MonteCarloConfig as MonteCarloConfig
     from koz_jax.config.presets import preset as preset
     from koz_jax.config.shield import ShieldConfig as ShieldConfig
@@ -33,6 +36,7 @@ if TYPE_CHECKING:
     from koz_jax.evaluation.summary import table as table
     from koz_jax.runs.trainer import train as train
     from koz_jax.task.environment import Reorientation as Reorientation
+    from koz_jax.task.maneuver import maneuver as maneuver
 
     __version__: str
 
@@ -57,6 +61,10 @@ _HOME = {
     "MonteCarlo": "evaluation.monte_carlo",
     "fly_case": "evaluation.cases",
     "fly_scenario": "evaluation.cases",
+    "maneuver": "task.maneuver",
+    "ManeuverConfig": "config.maneuver",
+    "load_maneuver": "config.maneuver_file",
+    "fly": "agents.flight",
     "summarise": "evaluation.summary",
     "table": "evaluation.summary",
     "KozError": "errors",

@@ -21,7 +21,7 @@ from koz_jax.task import dynamics, reward, scenario
 from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.observation_layout import LAYOUT, SLICES
 
-plt.rcParams |= {"figure.figsize": (8, 3), "figure.dpi": 80, "axes.grid": True, "grid.alpha": 0.4}
+plt.rcParams |= {"figure.figsize": (6.8, 2.8), "axes.grid": True, "grid.alpha": 0.4}
 
 # %% [markdown]
 # Every number of the task is a setting, validated once and in degrees; `Reorientation` is the environment made of them,
@@ -82,7 +82,6 @@ plt.show()
 # %%
 history, result = flights["phase2"]
 picture = sphere.draw(history, task, "phase2 on the paper's test scenario")
-picture.set_dpi(70)
 display(picture)
 
 # %% [markdown]
@@ -104,7 +103,7 @@ states = jax.tree.map(lambda leaf: leaf[:-1], history.state)
 actions = history.torque_B[:-1] / env.nominal_limits.box_B
 terms = jax.vmap(env.step)(states, actions).terms
 
-figure, (upper, lower) = plt.subplots(2, 1, figsize=(8, 4.5), layout="constrained", sharex=True)
+figure, (upper, lower) = plt.subplots(2, 1, figsize=(6.8, 4.2), layout="constrained", sharex=True)
 for name, values in vars(terms).items():
     weighted = values * getattr(reward.PAPER_WEIGHTS, name)
     axes = upper if name in ("attitude", "settled") else lower
@@ -124,11 +123,11 @@ config = preset("fast")
 updates = jnp.arange(0, config.curriculum.updates, 200)
 at = jax.vmap(functools.partial(curriculum.difficulty, config.curriculum))(updates)
 
-figure, ((angles, zone), (effort, rate)) = plt.subplots(2, 2, figsize=(8, 4.5), layout="constrained", sharex=True)
+figure, ((angles, zone), (effort, rate)) = plt.subplots(2, 2, figsize=(6.8, 4.2), layout="constrained", sharex=True)
 angles.fill_between(updates, np.rad2deg(at.min_angle), np.rad2deg(at.max_angle), alpha=0.4)
 angles.set(ylabel="deviation drawn [°]")
 zone.plot(updates, at.zone_weight)
-zone.set(ylabel="weight of the zone penalty")
+zone.set(ylabel="weight of the zone")
 effort.plot(updates, at.effort_weight)
 effort.set(xlabel="updates", ylabel="weight of effort")
 rate.plot(updates, at.learning_rate)

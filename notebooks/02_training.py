@@ -7,19 +7,18 @@
 
 # %%
 # %matplotlib inline
-import os
 from pathlib import Path
 
 import numpy as np
 from IPython.display import display
+from pydantic import ValidationError
 
-from koz_jax import TrainConfig, fly_scenario, monte_carlo, preset, summarise, table, train
+from koz_jax import TrainConfig, fly_scenario, load_agent, monte_carlo, preset, table, train
 from koz_jax.figures import learning, sphere
 from koz_jax.storage import runtime
 from koz_jax.task import scenario
 
 runtime.configure()  # all cores; compiled programs are kept for the next time
-small = os.environ.get("KOZ_JAX_BUDGET") == "small"
 
 # %% [markdown]
 # ## Settings
@@ -27,14 +26,14 @@ small = os.environ.get("KOZ_JAX_BUDGET") == "small"
 # agents. To change one, change its content and validate again.
 
 # %%
-short = preset("smoke" if small else "short")
+short = preset("short")
 config = TrainConfig.model_validate(short.model_dump() | {"seed": 0})
 
 # A setting that makes no sense is named, before any computing.
 try:
     TrainConfig.model_validate(config.model_dump() | {"eval_min_angle_deg": 170.0, "eval_max_angle_deg": 120.0})
-except ValueError as error:
-    print(error.errors()[0]["msg"])  # pyright: ignore[reportAttributeAccessIssue]
+except ValidationError as error:
+    print(error.errors()[0]["msg"])
 
 # %% [markdown]
 # ## Train
@@ -42,8 +41,8 @@ except ValueError as error:
 
 # %%
 run = Path("runs", "notebook")
-agent = train(config, run, progress=False)
-assert agent is not None
+train(config, run, progress=False)
+agent = load_agent(run)
 print(*sorted(str(path.relative_to(run)) for path in run.glob("*")), sep="\n")
 
 # %% [markdown]
@@ -51,8 +50,7 @@ print(*sorted(str(path.relative_to(run)) for path in run.glob("*")), sep="\n")
 # `metrics.csv` has a row per logged chunk. `koz curves RUN [RUN ...]` draws the same figure of one or several runs.
 
 # %%
-picture = learning.draw(learning.curves([learning.read_metrics(run)]))
-picture.set_dpi(70)
+picture = learning.draw(learning.read_curves([run]))
 display(picture)
 
 # %% [markdown]
@@ -62,9 +60,8 @@ display(picture)
 # ## Evaluate
 
 # %%
-cases = 500 if small else 5_000
-flown = monte_carlo(agent, cases=cases)
-print(table(summarise(flown.results), cases, "this agent"))
+flown = monte_carlo(agent, cases=5_000)
+print(table(flown, name="this agent"))
 
 # %% [markdown]
 # And the paper's test scenario:
@@ -73,5 +70,4 @@ print(table(summarise(flown.results), cases, "this agent"))
 history, result = fly_scenario(agent, scenario.paper_test())
 print(f"settled: {bool(result.settled)}, smallest margin: {np.rad2deg(float(result.min_margin)):.2f}°")
 picture = sphere.draw(history, config.task, "the paper's test scenario")
-picture.set_dpi(70)
 display(picture)

@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from IPython.display import display
 
-from koz_jax import fly_case, load_agent, monte_carlo, summarise, table
+from koz_jax import fly_case, load_agent, monte_carlo, table
 from koz_jax.evaluation.cases import draw_case
 from koz_jax.evaluation.tables import describe_case
 from koz_jax.figures import monte_carlo as figures
@@ -22,13 +22,12 @@ from koz_jax.viewer.maneuver import fly
 from koz_jax.viewer.page import write_page
 
 runtime.configure()  # all cores; compiled programs are kept for the next time
-plt.rcParams |= {"figure.figsize": (8, 3), "figure.dpi": 80, "axes.grid": True, "grid.alpha": 0.4}
+plt.rcParams |= {"figure.figsize": (6.8, 2.8), "axes.grid": True, "grid.alpha": 0.4}
 
 # %%
 agent = load_agent("phase2")
 flown = monte_carlo(agent, cases=10_000)
-summary = summarise(flown.results)
-print(table(summary, flown.config.cases, "phase2"))
+print(table(flown))
 print(f"compiled in {flown.compile_s:.1f} s, flown in {flown.wall_s:.1f} s")
 
 # %% [markdown]
@@ -38,7 +37,6 @@ print(f"compiled in {flown.compile_s:.1f} s, flown in {flown.wall_s:.1f} s")
 # %%
 results = flown.results
 picture = figures.draw_samples(figures.points(results, agent.task))
-picture.set_dpi(60)
 display(picture)
 
 # %% [markdown]
@@ -71,7 +69,6 @@ plt.show()
 # %%
 history, _ = fly_case(agent, int(worst[0]), flown.config)
 picture = sphere.draw(history, agent.task, f"case {worst[0]}")
-picture.set_dpi(70)
 display(picture)
 
 # %% [markdown]

@@ -1,6 +1,7 @@
 """Execute the notebooks and write them as ``.ipynb``: ``python notebooks/build.py``.
 
-The ``.py`` files are the only sources (Jupytext's percent format).  ``KOZ_JAX_BUDGET=small`` makes them cheap, for CI.
+The ``.py`` files are the only sources (Jupytext's percent format).  ``KOZ_JAX_BUDGET=small`` makes what is executed
+cheap, for CI: the notebooks themselves know nothing of it.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import argparse
 import base64
 import concurrent.futures
+import io
 import os
 import sys
 import tempfile
@@ -19,6 +21,7 @@ import jupytext
 from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
 from nbformat import NotebookNode, validate, writes
+from PIL import Image
 
 from koz_jax.cli.exit_status import exit_status
 from koz_jax.errors import KozError, SettingsError
@@ -28,6 +31,18 @@ HERE = Path(__file__).resolve().parent
 # Small enough for a code host to show; most pictures are below half of it.
 LARGEST_PICTURE = 200_000  # bytes
 LARGEST_TEXT = 10_000  # characters
+# Pictures must not be shrunk by a page of this width; figures have no letters below 7.5 points, so that this resolution
+# makes them 9 pixels high.
+WIDEST_PICTURE = 700  # pixels
+LEAST_DPI = 86.4
+
+# What a small budget puts in place of what a notebook says.
+_CHEAPER = {
+    'preset("short")': 'preset("smoke")',
+    "cases=5_000": "cases=500",
+    "cases = 2_000": "cases = 500",
+    "cases=10_000": "cases=1_000",
+}
 
 
 class NotebookError(KozError):
@@ -57,7 +72,7 @@ def _build(chosen: list[str], names: list[str], out: Path, jobs: int) -> int:
 
     def build(name: str) -> None:
         start = time.perf_counter()
-        notebook = execute(HERE / f"{name}.py")
+        notebook = execute(HERE / f"{name}.py", cheaply=os.environ.get("KOZ_JAX_BUDGET") == "small")
         files.write_text(out / f"{name}.ipynb", writes(notebook) + "\n")
         print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
 
@@ -68,14 +83,19 @@ def _build(chosen: list[str], names: list[str], out: Path, jobs: int) -> int:
     return 0
 
 
-def execute(source: Path) -> NotebookNode:
+def execute(source: Path, cheaply: bool = False) -> NotebookNode:
     """Run a notebook from top to bottom in a fresh process, in an empty folder.
+
+    cheaply: with less training and fewer cases than it says.
 
     Raises:
         NotebookError: a cell fails, or leaves too large an output or a figure without its picture.
 
     """
     notebook = jupytext.read(source)
+    for cell in notebook.cells:
+        for said, cheaper in _CHEAPER.items() if cheaply else ():
+            cell.source = cell.source.replace(said, cheaper)
     notebook.metadata = NotebookNode(kernelspec=_KERNEL, language_info={"name": "python"})
     with tempfile.TemporaryDirectory(prefix="koz_jax-notebook-") as folder:
         client = NotebookClient(
@@ -116,13 +136,38 @@ def _checked(output: Any, name: str) -> Any:
         raise SettingsError(
             f"{name}: a figure shows as {data['text/plain']}; begin the notebook with %matplotlib inline"
         )
-    picture = len(base64.b64decode(data.get("image/png", "")))
+    picture = _shrunk(base64.b64decode(data.get("image/png", "")))
+    if picture:
+        data["image/png"] = base64.b64encode(picture).decode()
     text = len(str(output.get("text", "")))
-    if picture > LARGEST_PICTURE or text > LARGEST_TEXT:
+    if len(picture) > LARGEST_PICTURE or text > LARGEST_TEXT:
         raise SettingsError(
-            f"{name}: an output is too large: a picture of {picture} bytes, a text of {text} characters"
+            f"{name}: an output is too large: a picture of {len(picture)} bytes, a text of {text} characters"
         )
+    if picture:
+        _check_readable(picture, name)
     return output
+
+
+def _shrunk(picture: bytes) -> bytes:
+    """Write a large PNG again with a palette; thousands of points on each other have thousands of colours."""
+    if len(picture) <= LARGEST_PICTURE:
+        return picture
+    with Image.open(io.BytesIO(picture)) as image:
+        content = io.BytesIO()
+        few_colours = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+        few_colours.save(content, "png", optimize=True, dpi=image.info["dpi"])
+    return content.getvalue()
+
+
+def _check_readable(picture: bytes, name: str) -> None:
+    with Image.open(io.BytesIO(picture)) as image:
+        dpi = float(image.info.get("dpi", (0.0, 0.0))[0])
+        if image.width > WIDEST_PICTURE or dpi < LEAST_DPI:
+            raise SettingsError(
+                f"{name}: letters of a picture would be too small: must be at most {WIDEST_PICTURE} pixels wide, at"
+                f" {LEAST_DPI:g} dpi or more; got {image.width} at {dpi:.1f}"
+            )
 
 
 if __name__ == "__main__":

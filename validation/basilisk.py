@@ -133,18 +133,18 @@ def compare_cases(data: dict[str, np.ndarray], controller: CLibrary) -> bool:
     fleet = Fleet(data["q_BN"], data["omega_BN_B"], data["inertia"], dt)
     axis_N, half_angle = with_absent_zones(data["zone_axis_N"], data["zone_half_angle"], controller.zones)
     margins, errors, effort = [], [], np.zeros(len(half_angle))
-    before = None
+    memory = None
     for step in range(steps + 1):
         q_BN, omega = fleet.state()
-        q_e = relative(data["q_DN"].astype(float), q_BN)
-        errors.append(angle(q_e))
+        errors.append(angle(relative(data["q_DN"].astype(float), q_BN)))
         margins.append(np.min(separation(q_BN, data["boresight_B"], axis_N) - half_angle, axis=1))
         if step == steps:
             break
-        before = q_e[:, 0] if before is None else before
-        told = (q_BN, omega, data["q_DN"], axis_N.reshape(len(q_BN), -1), half_angle, before[:, None])
-        torque_B = controller.torque(controller.observe(np.concatenate(told, axis=1)))
-        before = q_e[:, 0]
+        # As a star tracker hands it over: what the controller makes of it does not depend on the sign.
+        measured = q_BN * np.where(q_BN[:, :1] < 0.0, -1.0, 1.0)
+        told = np.concatenate([measured, omega, data["q_DN"], axis_N.reshape(len(q_BN), -1), half_angle], axis=1)
+        observation, memory = controller.observe(told, controller.start(told) if memory is None else memory)
+        torque_B = controller.torque(observation)
         fleet.torque(torque_B)
         fleet.advance()
         effort += np.sum(torque_B.astype(float) ** 2, axis=1) * dt

@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from koz_jax.adapters.forks import refuse_in_fork
 from koz_jax.adapters.vector_env import episode_keys
 from koz_jax.config.task import TaskConfig
 from koz_jax.errors import SettingsError
@@ -40,6 +41,7 @@ class ReorientationEnv(Env):
         self, task: TaskConfig | None = None, min_angle_deg: float = 80.0, max_angle_deg: float = 180.0
     ) -> None:
         """Deviations are uniform between the two angles [deg]."""
+        refuse_in_fork()
         self.reorientation = Reorientation.from_config(task, min_angle_deg, max_angle_deg)
 
     @property
@@ -115,7 +117,8 @@ class ResampleWrapper(Wrapper):
         over = after.done > 0
         episode = after.info["episode"] + over
 
-        pipeline_state, obs = self.unwrapped.reorientation.autoreset(
+        bare: Any = self.unwrapped
+        pipeline_state, obs = bare.reorientation.autoreset(
             over, after.pipeline_state, after.obs, lambda: episode_keys(_typed(after.info["key"]), episode)
         )
         info = {**after.info, "episode": episode, "final_observation": after.obs}

@@ -49,14 +49,18 @@ class ReorientationVecEnv(VecEnv):
         super().__init__(num_envs, *single_spaces(task))
 
     def reset(self) -> npt.NDArray[np.float32]:
-        """Begin new random scenarios: the first of the seeds where ``seed`` was called, else the next ones."""
-        if any(self._options):
-            raise SettingsError(f"options: a reset takes none, got {self._options}")
+        """Begin new random scenarios: the first of the seeds where ``seed`` was called, else the next ones.
+
+        Options that ``set_options`` has set for an environment, as those of ``gym_env.ReorientationEnv.reset``, give
+        the scenario of its next episode instead.
+        """
+        given = [self._envs.scenario_of(options) for options in self._options]
         if not self._envs.begun and self._seeds[0] is None:
             self.seed()
         seeds = [seed for seed in self._seeds if seed is not None]
-        observed = self._envs.reset(seeds or None)
+        observed = self._envs.reset(seeds or None, given)
         self._reset_seeds()
+        self._reset_options()
         return observed
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:

@@ -9,6 +9,7 @@ from koz_jax.cli import invocation
 from koz_jax.cli.exit_status import exit_status
 from koz_jax.cli.flags import parsing
 from koz_jax.config.base import Settings
+from koz_jax.evaluation.digits import significant
 
 _HEAD = ("agent", "zones", "start up to", "success", "violated", "settling time", "effort", "cases")
 
@@ -39,13 +40,16 @@ def _row(name: str, record: Record) -> tuple[str, ...]:
     def told(key: str, form: str) -> str:
         return form.format(table[key]) if key in table else "-"
 
+    def measured(key: str, decimals: int, unit: str) -> str:
+        return f"{significant(float(table[key]), decimals)} {unit}" if key in table else "-"
+
     return (
         name,
         str(many) if few == many else f"{few} to {many}",
         f"{scenario.max_rate_deg:g} deg/s",
         told("success_rate", "{:.2%}"),
         told("violation_rate", "{:.2%}"),
-        told("settling_time_mean", "{:.2f} s"),
-        told("control_effort_mean", "{:.1f} N2 m2 s"),
+        measured("settling_time_mean", 2, "s"),
+        measured("control_effort_mean", 1, "N2 m2 s"),
         told("cases", "{}"),
     )

@@ -34,7 +34,7 @@ def _draw(asked: CurvesFlags) -> int:
 
     if not asked.runs:
         raise SettingsError("runs: give the folder of one run or more")
-    shown = learning.curves([learning.read_metrics(run) for run in asked.runs])
+    shown = learning.read_curves(asked.runs)
     if not len(shown.done):
         raise SettingsError(f"runs: no evaluation in {', '.join(map(str, asked.runs))} yet")
     files.make_folder("out", asked.out)

@@ -133,7 +133,7 @@ def _report(flown: MonteCarlo, task: TaskConfig, label: str, asked: EvaluateFlag
     from koz_jax.storage import files
 
     summary = summarise(flown.results)
-    print(table(summary, asked.cases, label, asked.shield))
+    print(table(flown))
     print(f"compiled in {flown.compile_s:.1f} s, flown in {flown.wall_s:.1f} s")
     if asked.json_file:
         files.write_json(asked.json_file, monte_carlo.report(flown, summary))
@@ -141,8 +141,8 @@ def _report(flown: MonteCarlo, task: TaskConfig, label: str, asked: EvaluateFlag
         files.write_text(asked.csv, tables.cases_csv(flown.results))
     if asked.figures:
         from koz_jax.figures import monte_carlo as drawn
-        from koz_jax.figures import style
+        from koz_jax.figures import wording
 
-        title = f"{style.short_name(label)}: {asked.cases} random cases, seed {asked.seed}"
+        title = f"{wording.short_name(label)}: {asked.cases} random cases, seed {asked.seed}"
         for path in drawn.write(asked.figures, flown.results, task, title):
             print(f"figure: {path}")

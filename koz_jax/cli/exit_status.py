@@ -39,6 +39,12 @@ def exit_status(command: Callable[[], int]) -> int:
         if isinstance(error, KozError) and error.ends_all_processes:
             return 2
         return _alone(2)
+    except (AssertionError, RuntimeError):
+        missing = _missing_platform()
+        if missing is None:
+            raise
+        print(f"error: {missing}", file=sys.stderr)
+        return _alone(2)
     except BrokenPipeError:
         # The reader of the output has left (``koz train --help | head``); nor may Python's last flush complain.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -46,6 +52,22 @@ def exit_status(command: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return _alone(130)
+
+
+def _missing_platform() -> str | None:
+    """Say in a line that jax finds nothing of the kind of device that JAX_PLATFORMS asks for; None if it does."""
+    jax = sys.modules.get("jax")
+    asked = None if jax is None else jax.config.jax_platforms
+    if jax is None or not asked:
+        return None
+    try:
+        jax.devices()
+    except (AssertionError, RuntimeError) as error:  # the former where the plugin of the platform is not installed
+        reason = (str(error).splitlines() or ["no plugin for it is installed; for GPUs: pip install 'koz_jax[cuda]'"])[
+            0
+        ]
+        return f"JAX_PLATFORMS: {asked!r} cannot be used ({reason}); unset it to run on what there is"
+    return None
 
 
 def _alone(status: int) -> int:

@@ -14,28 +14,51 @@ from koz_jax.cli.exit_status import exit_status
 from koz_jax.cli.flags import parsing
 from koz_jax.cli.flags.flight import AGENT
 from koz_jax.config.base import MarginDeg, Settings
-from koz_jax.config.shield import ShieldConfig
+from koz_jax.config.shield import CERTAIN, ShieldConfig, UncertaintyConfig
 
 
-class ExportFlags(Settings):
-    """Write a trained agent as C99 source, ONNX, or StableHLO."""
+class _FormatFlags(Settings):
+    """Who is exported to what."""
 
     agent: Positional[str] = Field(description=f"Who is exported: {AGENT}.")
     to: Literal["c", "onnx", "stablehlo"]
-    """c: C99 with a self-test; onnx: a graph for onnxruntime; stablehlo: a program for XLA and jax.export."""
+    """c: C99 with a self-test and an example; onnx: a graph for onnxruntime; stablehlo: a program for XLA."""
     out: Path
     """Folder to write into; the files of an earlier export to the same format are replaced."""
     shield: bool = False
     """Also write the shield, which keeps the boresight out of every zone; for --to c."""
     shield_margin_deg: MarginDeg = parsing.same_as(ShieldConfig, "margin_deg")
+    robust: bool = False
+    """Make the shield withstand errors, which the next four flags set."""
+
+
+class ExportFlags(UncertaintyConfig, _FormatFlags):
+    """Write a trained agent as C99 source, ONNX, or StableHLO."""
 
     @model_validator(mode="after")
     def _of_the_shield(self) -> Self:
         if self.shield and self.to != "c":
             raise ValueError(f"shield: is exported as C only, got --to {self.to}")
-        if not self.shield and self.shield_margin_deg != ShieldConfig().margin_deg:
-            raise ValueError(f"shield_margin_deg: needs --shield, got {self.shield_margin_deg} without it")
+        if not self.shield:
+            if self.robust:
+                raise ValueError("robust: is of the shield, and needs --shield")
+            if self.shield_margin_deg != ShieldConfig().margin_deg:
+                raise ValueError(f"shield_margin_deg: needs --shield, got {self.shield_margin_deg} without it")
+        if self.robust and self._errors == CERTAIN:
+            raise ValueError("robust: needs an error to withstand, such as --inertia-error 0.1")
+        for name, error in self._errors.model_dump().items():
+            if error and not self.robust:
+                raise ValueError(f"{name}: is for the shield to withstand and needs --robust, got {error} without it")
         return self
+
+    @property
+    def _errors(self) -> UncertaintyConfig:
+        return UncertaintyConfig(**self.model_dump(include={*UncertaintyConfig.model_fields}))
+
+    @property
+    def shield_config(self) -> ShieldConfig | None:
+        """The shield to export, if one is asked for."""
+        return ShieldConfig(margin_deg=self.shield_margin_deg, error_bounds=self._errors) if self.shield else None
 
 
 def main(argv: Sequence[str]) -> int:
@@ -50,7 +73,6 @@ def _export(asked: ExportFlags) -> int:
     from koz_jax.storage.files import make_folder
 
     make_folder("out", asked.out)
-    shield = ShieldConfig(margin_deg=asked.shield_margin_deg) if asked.shield else None
-    for path in write_files(asked.out, export(load_agent(asked.agent), asked.to, shield)):
+    for path in write_files(asked.out, export(load_agent(asked.agent), asked.to, asked.shield_config)):
         print(path)
     return 0

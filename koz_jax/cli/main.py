@@ -16,6 +16,7 @@ COMMANDS = {
     "tune": "tune the gains of a classical controller",
     "agents": "list the agents inside the package",
     "curves": "draw the learning curves of runs",
+    "trim": "remove from finished runs what only a resume needs, which is most of their size",
 }
 
 

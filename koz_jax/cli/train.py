@@ -25,6 +25,8 @@ from koz_jax.errors import SettingsError
 if TYPE_CHECKING:
     from koz_jax.agents.agent import Agent
 
+_CASES = 10_000  # of the table, unless told otherwise
+
 _HELPS = {"preset": f"Settings to begin from: {', '.join(PRESETS)}; every other flag changes one of them."}
 
 
@@ -37,8 +39,8 @@ class TrainFlags(ProcessFlags):
     """Go on exactly where the run in this folder stopped; takes all settings from it."""
     start_from: Path | None = None
     """Begin with the learner and the replay buffer of a snapshot, or of another run."""
-    cases: CaseCount = 10_000
-    """Monte Carlo cases of the table at the end."""
+    cases: CaseCount | None = None
+    """Monte Carlo cases of the table at the end; by default 10,000, or as many as a resumed run was begun with."""
     devices: PositiveInt = 1
     """Divide the environments and the replay buffer among so many devices of each process (not with --seeds)."""
     seeds: Annotated[int, Field(gt=0, le=1000)] = 1
@@ -64,13 +66,7 @@ def parse(argv: Sequence[str]) -> tuple[TrainConfig, TrainFlags]:
 
     """
     prog = invocation.command("train")
-    first = argparse.ArgumentParser(prog=prog, add_help=False, allow_abbrev=False)
-    first.add_argument("--preset", nargs="?", const="")
-    first.add_argument("--resume", nargs="?", const="")
-    # With these a run may also be resumed.
-    for name in ("cases", "devices", "coordinator", "processes", "process"):
-        first.add_argument(f"--{name}", nargs="?")
-    chosen, others = first.parse_known_args(argv)
+    chosen, others = _first_look(argv)
     if chosen.preset is not None:
         others += ["--preset", chosen.preset]
     if chosen.resume is not None and others and not {"-h", "--help"} & set(argv):
@@ -78,6 +74,29 @@ def parse(argv: Sequence[str]) -> tuple[TrainConfig, TrainFlags]:
     begin_from = preset("fast" if chosen.preset is None else chosen.preset)
     asked, config = parsing.parse_with(TrainFlags, begin_from, argv, prog, _HELPS)
     return config, asked
+
+
+def _first_look(argv: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
+    """Find what decides how the rest is read, and what a run may also be resumed with; and all the rest."""
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--preset", nargs="?", const="")
+    first.add_argument("--resume", nargs="?", const="")
+    for name in ("cases", "devices", "coordinator", "processes", "process"):
+        first.add_argument(f"--{name}", nargs="?")
+    return first.parse_known_args(argv)
+
+
+def _cases(asked: TrainFlags, run: Path) -> int:
+    """Cases of the table: as asked for, or as the run was begun with."""
+    from koz_jax.runs.folder import RunFolder
+
+    if asked.cases is not None:
+        return asked.cases
+    try:
+        begun_with = _first_look(shlex.split(RunFolder(run).read_command()))[0].cases
+        return _CASES if begun_with is None else round(float(begun_with))
+    except (ValueError, OverflowError):  # somebody else wrote it
+        return _CASES
 
 
 def main(argv: Sequence[str]) -> int:
@@ -108,7 +127,7 @@ def _train(config: TrainConfig, asked: TrainFlags, command: str) -> int:
         command=command,
     )
     # The others wait for the first, which reports.
-    return processes.all_or_none(lambda: 0 if asked.process > 0 else _report(agent, config, asked.cases, run))
+    return processes.all_or_none(lambda: 0 if asked.process > 0 else _report(agent, config, _cases(asked, run), run))
 
 
 def _report(agent: Agent | None, config: TrainConfig, cases: int, run: Path) -> int:
@@ -119,11 +138,16 @@ def _report(agent: Agent | None, config: TrainConfig, cases: int, run: Path) -> 
 
     if agent is None:
         return _stopped(run)
-    shield = config.shielding.in_force
+    folder, shield = RunFolder(run), config.shielding.in_force
     flown = monte_carlo.monte_carlo(agent, cases, shield=shield)
-    summary = summarise(flown.results)
-    files.write_json(RunFolder(run).evaluation, monte_carlo.report(flown, summary))
-    print(table(summary, cases, run.resolve().name + (" + shield" if shield else ""), shield is not None))
+    files.write_json(folder.evaluation, monte_carlo.report(flown, summarise(flown.results)))
+    print(table(flown, name=run.resolve().name + (" + shield" if shield else "")))
+    record = agent.provenance
+    if record.refinements_tried and not record.refinements:
+        print(f"refinement did not improve the agent; kept the one of update {record.updates}")
+    if folder.checkpoints():
+        trim = f"{invocation.command('trim')} {shlex.quote(str(run))}"
+        print(f"{run} takes {folder.size / 1e6:.0f} MB, most of it to resume from; make it small with: {trim}")
     shielded = f"--shield --shield-margin-deg {shield.margin_deg:g} " if shield else ""
     evaluate = invocation.command("evaluate")
     print(f"\nlook further: {evaluate} --agent {shlex.quote(str(run))} {shielded}--csv cases.csv")
@@ -145,14 +169,15 @@ def _train_seeds(config: TrainConfig, asked: TrainFlags, run: Path, command: str
     runtime.configure()
     if asked.resume is None:
         start_from = None if asked.start_from is None else str(asked.start_from.resolve())
-        plan = seeds.Plan(config=config, seeds=asked.seeds, start_from=start_from)
+        plan = seeds.Plan(config=config, seeds=asked.seeds, start_from=start_from, cases=asked.cases or _CASES)
         seeds.begin(run, plan)
     else:
         plan = seeds.read_plan(run)
     if not seeds.train_all(run, plan, command=command):
         return _stopped(run)
-    best, found = seeds.evaluate(run, plan, asked.cases)
-    print(seeds.table(found, asked.cases))
+    cases = asked.cases or plan.cases
+    best, found = seeds.evaluate(run, plan, cases)
+    print(seeds.table(found, cases))
     evaluate = invocation.command("evaluate")
     print(f"\nthe best (seed {best.provenance.seed}): {evaluate} --agent {shlex.quote(str(run))}")
     return 0

@@ -146,8 +146,8 @@ def describe(controller: Controller) -> str:
 def print_table(named: NamedController, asked: TuneFlags, label: str) -> None:
     """Fly the cases that are tuned on, and print the paper's table."""
     from koz_jax.evaluation import monte_carlo
-    from koz_jax.evaluation.summary import summarise, table
+    from koz_jax.evaluation.summary import table
 
     flown = monte_carlo.run_cases(named, named.task, asked.config())
     print(f"\n{label}: {describe(named.controller)}")
-    print(table(summarise(flown.results), asked.cases, asked.name), flush=True)
+    print(table(flown, name=asked.name), flush=True)

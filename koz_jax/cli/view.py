@@ -19,28 +19,20 @@ if TYPE_CHECKING:
     from koz_jax.control.base import TaskController
 
 
+# Who flies where nobody is named.
+DEFAULT_AGENTS = ("phase1", "phase2")
+
+
 class _AgentsFlags(Settings):
     """Who flies."""
 
-    agent: tuple[str, ...] = Field(default=("phase1", "phase2"), description=f"Who flies: {AGENTS}.")
-    controller: str | None = Field(
-        default=None, description=f"Show this one too, on the first agent's task: {CONTROLLERS}."
+    agent: tuple[str, ...] = Field(
+        default=(),
+        description=f"Who flies: {AGENTS}. By default those of {' and '.join(DEFAULT_AGENTS)} whose spacecraft it is.",
     )
-
-    def load(self) -> list[TaskController]:
-        """Load all who fly.
-
-        Raises:
-            SettingsError: there is no such agent or controller.
-
-        """
-        from koz_jax.agents.agent import load_agent
-        from koz_jax.control.registry import load_controller
-
-        flying: list[TaskController] = [load_agent(name) for name in self.agent]
-        if self.controller is not None:
-            flying.append(load_controller(self.controller, flying[0].task if flying else None))
-        return flying
+    controller: str | None = Field(
+        default=None, description=f"Show this one too, on the first agent's task or the maneuver's: {CONTROLLERS}."
+    )
 
 
 class ViewFlags(OneCaseFlags, _AgentsFlags):
@@ -50,6 +42,33 @@ class ViewFlags(OneCaseFlags, _AgentsFlags):
     """How much of the maneuver to show [s]; by default until soon after the last agent has settled."""
     out: Path = Path("maneuver.html")
     """The file to write."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Agents that fly."""
+        return self.agent or DEFAULT_AGENTS
+
+    def load(self) -> list[TaskController]:
+        """Load all who fly.
+
+        Raises:
+            SettingsError: there is no such agent or controller, or nobody is named who can fly the spacecraft.
+
+        """
+        from koz_jax.agents.agent import load_agent
+        from koz_jax.agents.flight import load_for
+        from koz_jax.control.registry import load_controller
+        from koz_jax.evaluation.maneuver import unfamiliar
+
+        flying: list[TaskController] = [load_agent(name) for name in self.names]
+        own = self.own_maneuver
+        if own is not None and not self.agent:
+            flying = [agent for agent in flying if not unfamiliar(agent, own)]
+        task = own.task if own is not None else flying[0].task
+        if self.controller is not None:
+            flying.append(load_controller(self.controller, task))
+        # Where nobody is left, the default agent is refused with a reason.
+        return flying if flying or own is None else [load_for(own)]
 
 
 def main(argv: Sequence[str]) -> int:
@@ -61,10 +80,10 @@ def _view(asked: ViewFlags) -> int:
     # jax is imported only now: --help and flags that do not exist are answered at once.
     from koz_jax.evaluation.tables import describe_result
     from koz_jax.storage import files, runtime
+    from koz_jax.viewer import maneuver as viewed
     from koz_jax.viewer import page
-    from koz_jax.viewer.maneuver import fly
 
-    page.check_count("agent", len(asked.agent) + (asked.controller is not None))
+    page.check_count("agent", len(asked.names) + (asked.controller is not None))
     files.check_writable("out", asked.out)
     page.plotly_library()
     runtime.configure()
@@ -72,7 +91,7 @@ def _view(asked: ViewFlags) -> int:
     tasks = [asked.task(agent) for agent in flying]
     drawn = asked.scenario(tasks[0])
     maneuvers = [
-        fly(agent, drawn, asked.label(agent), task=task, config=asked.config(), case=asked.case or 0)
+        viewed.fly(agent, drawn, asked.label(agent), task=task, config=asked.config(), case=asked.case or 0)
         for agent, task in zip(flying, tasks, strict=True)
     ]
     page.write_page(asked.out, maneuvers, f"Maneuver: {asked.what}", asked.seconds)

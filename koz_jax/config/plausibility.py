@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from koz_jax.config.task import SpacecraftConfig, TaskConfig
+from koz_jax.config.training import TrainConfig
 from koz_jax.errors import SettingsError
 
 # [rad] Turn within a single step, from rest by full torque, above which a held torque can no longer steer.
@@ -108,3 +109,24 @@ def check(task: TaskConfig, min_angle_deg: float, max_angle_deg: float) -> None:
         raise SettingsError("\n".join(hopeless))
     for finding in found:
         _log.warning("%s", finding.text)
+
+
+def check_training(config: TrainConfig) -> None:
+    """Refuse a training of which nothing can come, and warn of what is suspicious.
+
+    Raises:
+        SettingsError: the task is hopeless; the message has the number.
+
+    """
+    check(config.task, config.eval_min_angle_deg, config.eval_max_angle_deg)
+    slowest = agilities(config.task.spacecraft)[0]
+    least = slowest.turn_seconds(config.eval_max_angle_deg)
+    lengths = {"training_episode_seconds": config.training_episode_seconds}
+    if config.refine.iterations:
+        lengths["refine.horizon_seconds"] = config.refine.horizon_seconds
+    for name, seconds in lengths.items():
+        if seconds < least <= config.task.episode_seconds:
+            _log.warning(
+                "%s: is %g s, and a turn by %g deg takes %.3g s or more (%s); it should be longer",
+                *(name, seconds, config.eval_max_angle_deg, least, slowest),
+            )

@@ -81,9 +81,7 @@ def as_task_controller(given: TaskController | Controller, task: TaskConfig | No
 
     """
     if isinstance(given, type):
-        raise SettingsError(
-            f"agent: must be an object, got the class {given.__name__}; give {given.__name__}()"
-        )
+        raise SettingsError(f"agent: must be an object, got the class {given.__name__}; give {given.__name__}()")
     flying: Any = given
     if not all(hasattr(given, name) for name in ("name", "task", "controller")):
         if not hasattr(given, "decide"):

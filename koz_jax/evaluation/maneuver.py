@@ -114,6 +114,9 @@ def describe(maneuver: ManeuverConfig, flown: FlownManeuver) -> str:
         lines.append(f"target: the roll that the smallest rotation gives, {chosen}; attitude {_row(maneuver)}")
     for i, (one, margin) in enumerate(zip(maneuver.constraints, flown.margins_deg, strict=True)):
         lines.append(f"constraints.{i}: {one.instrument} {margin:.4g} deg outside {one.half_angle_deg:g} deg")
+    looking = list(dict.fromkeys(one.instrument for one in maneuver.constraints))
+    if len(looking) > 1:
+        lines.append(f"pictures show where {looking[0]} looks, not {', '.join(looking[1:])}")
     return "\n".join([*lines, *_comparison(maneuver, flown)])
 
 

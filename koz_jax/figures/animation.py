@@ -7,7 +7,7 @@ import numpy as np
 
 from koz_jax.config.task import TaskConfig
 from koz_jax.evaluation.rollout import CaseResult, History
-from koz_jax.figures import geometry, palette, sphere, style
+from koz_jax.figures import geometry, palette, sphere, style, wording
 from koz_jax.figures.style import Axes
 from koz_jax.storage import files
 
@@ -61,14 +61,15 @@ class _Scene:
         self.traces = geometry.sphere_traces(history)
         self.seconds = np.arange(len(history.zone_margin)) * task.step_seconds
         self.margin_deg = np.rad2deg(history.zone_margin)
-        self.torque = np.asarray(history.torque_B)
+        self.unit = wording.torque_unit(task.spacecraft.torque_limits)
+        self.torque = self.unit.factor * np.asarray(history.torque_B)
         self.projected = self.traces.view.project(self.traces.trace_N)
         self.figure = style.new_figure(7.6, 4.1)
         grid = self.figure.add_gridspec(2, 2, width_ratios=[1.1, 1.0])
         self._draw_sphere(self.figure.add_subplot(grid[:, 0]))
         self.margin_line = self._draw_margin(self.figure.add_subplot(grid[0, 1]), end)
         self.torque_lines = self._draw_torque(
-            self.figure.add_subplot(grid[1, 1]), end, max(task.spacecraft.torque_limits)
+            self.figure.add_subplot(grid[1, 1]), end, self.unit.factor * max(task.spacecraft.torque_limits)
         )
         handles, labels = self.figure.axes[0].get_legend_handles_labels()
         self.figure.legend(handles, labels, loc="outside lower center", ncols=5, handlelength=1.6, columnspacing=1.2)
@@ -102,7 +103,9 @@ class _Scene:
         return axes.plot([], [], color=palette.TRACE, linewidth=1.6)[0]
 
     def _draw_torque(self, axes: Axes, end: float, limit: float) -> list[style.Line2D]:
-        axes.set(xlim=(0.0, end), ylim=(-1.1 * limit, 1.1 * limit), xlabel="time [s]", ylabel="torque [N m]")
+        axes.set(
+            xlim=(0.0, end), ylim=(-1.1 * limit, 1.1 * limit), xlabel="time [s]", ylabel=f"torque [{self.unit.name}]"
+        )
         lines = [
             axes.plot([], [], color=color, linewidth=1.3, drawstyle="steps-post", label=name)[0]
             for name, color in zip("xyz", palette.BODY_AXES, strict=True)

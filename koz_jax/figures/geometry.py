@@ -28,6 +28,13 @@ def zones(history: History) -> list[Zone]:
     return [Zone(axis_N / np.linalg.norm(axis_N), float(angle)) for axis_N, angle in pairs if angle > 0.0]
 
 
+def zone_names(found: list[Zone]) -> list[str]:
+    """What to call zones in legends: numbered from 1 where there are several."""
+    return (
+        [f"zone {number}" for number in range(1, len(found) + 1)] if len(found) > 1 else ["keep-out zone"] * len(found)
+    )
+
+
 def boresight(history: History) -> np.ndarray:
     """The telescope in body axes, that of the first constraint.  Returns (3,) unit vector."""
     return np.asarray(history.state.scenario.constraints.boresight_B[0, 0])

@@ -5,14 +5,17 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from koz_jax.config.task import is_paper_task
 from koz_jax.errors import SettingsError, StorageError
 from koz_jax.evaluation.summary import PAPER_TABLE
-from koz_jax.figures import palette
+from koz_jax.figures import palette, wording
+from koz_jax.runs.folder import RunFolder
 
 if TYPE_CHECKING:
     from koz_jax.figures.style import Axes, Figure
@@ -23,7 +26,7 @@ _REFINEMENT_SHARE = 0.2
 
 @dataclasses.dataclass(frozen=True)
 class _Panel:
-    """One curve: its column, its axis, the factor to the axis' unit, and the paper's value in that unit."""
+    """One curve: its column, its axis, the factor to the axis' unit, and the paper's value in the column's unit."""
 
     column: str
     label: str
@@ -34,8 +37,8 @@ class _Panel:
 
 _PANELS = (
     _Panel("eval/mean_reward", "mean reward [-]", 1.0, PAPER_TABLE.mean_reward),
-    _Panel("eval/success_rate", "success [%]", 100.0, 100.0 * PAPER_TABLE.success_rate),
-    _Panel("eval/violation_rate", "zone violated [%]", 100.0, 100.0 * PAPER_TABLE.violation_rate),
+    _Panel("eval/success_rate", "success [%]", 100.0, PAPER_TABLE.success_rate),
+    _Panel("eval/violation_rate", "zone violated [%]", 100.0, PAPER_TABLE.violation_rate),
     _Panel("eval/settling_time_mean", "settling time [s]", 1.0, PAPER_TABLE.settling_time_mean),
     _Panel("eval/control_effort_mean", "control effort [N² m² s]", 1.0, PAPER_TABLE.control_effort_mean),
     _Panel(
@@ -69,6 +72,7 @@ class Curves:
     done: np.ndarray  # (instants,) updates, then iterations
     values: dict[str, np.ndarray]  # by column: (runs, instants)
     stages: Stages
+    is_paper_task: bool = False  # whether the paper's numbers are of what was learned
 
 
 def read_metrics(run: Path) -> dict[str, np.ndarray]:
@@ -127,7 +131,24 @@ def stages(logs: list[dict[str, np.ndarray]]) -> Stages:
     return Stages(phase1, learned=last(log, learning), length=last(log, np.ones_like(learning)))
 
 
-def curves(logs: list[dict[str, np.ndarray]]) -> Curves:
+def read_curves(runs: Sequence[Path]) -> Curves:
+    """Read the logs of runs, and whether all of them learn the paper's task.
+
+    Raises:
+        SettingsError: a folder is not a run's, or the runs cannot share an axis.
+        StorageError: a file of a run cannot be read.
+
+    """
+    logs = [read_metrics(run) for run in runs]
+    return curves(logs, is_paper_task=all(_learns_the_papers_task(RunFolder(run)) for run in runs))
+
+
+def _learns_the_papers_task(run: RunFolder) -> bool:
+    """Whether the run's settings say so; without them nothing is known."""
+    return run.config.is_file() and is_paper_task(run.read_config().task)
+
+
+def curves(logs: list[dict[str, np.ndarray]], is_paper_task: bool = False) -> Curves:
     """Bring the evaluations of several runs to common instants; between its own a run is interpolated."""
     evaluated = [np.isfinite(log["eval/mean_reward"]) for log in logs]
     done = np.unique(np.concatenate([log["updates"][rows] for log, rows in zip(logs, evaluated, strict=True)]))
@@ -139,25 +160,44 @@ def curves(logs: list[dict[str, np.ndarray]]) -> Curves:
         return np.interp(done, log["updates"][known], log[column][known], left=np.nan, right=np.nan)
 
     values = {panel.column: np.stack([at_instants(log, panel.column) for log in logs]) for panel in _PANELS}
-    return Curves(done, values, stages(logs))
+    return Curves(done, values, stages(logs), is_paper_task)
 
 
 def draw(shown: Curves, title: str = "") -> Figure:
-    """Draw the curves: the median of the runs as a line, from the lowest to the highest as a band."""
+    """Draw the curves: the median of the runs as a line, from the lowest to the highest as a band.
+
+    The paper's values are drawn where the runs learn its task.
+    """
     from koz_jax.figures import style
 
     with style.look():
-        figure = style.new_figure(9.6, 5.4)
-        panels = figure.subplots(2, 3, sharex=True).flat
-        for axes, panel in zip(panels, _PANELS, strict=True):
-            _draw_panel(axes, panel, shown)
+        figure = style.new_figure(6.8, 7.0)
+        panels = figure.subplots(3, 2, sharex=True)
+        for axes, panel in zip(panels.flat, _PANELS, strict=True):
+            _draw_panel(axes, _in_shown_unit(panel, shown), shown)
+            _draw_stages(axes, shown.stages)
+        for column in panels.T:
+            figure.align_ylabels(column)
         handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
+        # The label of the common time axis heads the legend: the layout makes room for one thing below the panels.
+        label = "gradient updates, + refinement iterations"
+        figure.legend(handles, labels, title=label, title_fontsize=9, loc="outside lower center", ncols=len(handles))
         figure.suptitle(title)
     return figure
 
 
+def _in_shown_unit(panel: _Panel, shown: Curves) -> _Panel:
+    """Efforts are shown in a unit that suits the spacecraft."""
+    if panel.column != "eval/control_effort_mean":
+        return panel
+    values = shown.values[panel.column]
+    unit = wording.effort_unit(float(np.max(values, initial=0.0, where=np.isfinite(values))))
+    return dataclasses.replace(panel, label=f"control effort [{unit.name}]", factor=unit.factor)
+
+
 def _draw_panel(axes: Axes, panel: _Panel, shown: Curves) -> None:
+    from koz_jax.figures import style
+
     values = panel.factor * shown.values[panel.column]
     known = np.isfinite(values).any(axis=0)
     x, values = shown.stages.position(shown.done[known]), values[:, known]
@@ -169,14 +209,15 @@ def _draw_panel(axes: Axes, panel: _Panel, shown: Curves) -> None:
         )
     label = f"median of {runs} runs" if runs > 1 else "evaluation during training"
     axes.plot(x, np.nanmedian(values, axis=0), color=palette.BLUE, marker=".", markersize=4, label=label)
-    axes.axhline(
-        panel.paper, color=palette.VERMILLION, linestyle="--", linewidth=1.0, label="paper's agent, 10,000 cases"
-    )
+    if shown.is_paper_task:
+        label = "paper's agent, 10,000 cases"
+        axes.axhline(panel.factor * panel.paper, color=palette.VERMILLION, linestyle="--", linewidth=1.0, label=label)
+    axes.set_ylabel(panel.label)
     if panel.logarithmic:
         axes.set_yscale("log")
-        axes.yaxis.set_major_formatter("{x:g}")
-    axes.set_ylabel(panel.label)
-    _draw_stages(axes, shown.stages)
+        style.decade_ticks(axes.yaxis)
+    else:
+        style.value_ticks(axes.yaxis)
 
 
 def _draw_stages(axes: Axes, found: Stages) -> None:
@@ -193,8 +234,6 @@ def _draw_stages(axes: Axes, found: Stages) -> None:
         begin = end
     axes.set_xticks(list(ticks), list(ticks.values()))
     axes.set_xlim(0.0, 1.02)
-    if axes.get_subplotspec().is_last_row():  # pyright: ignore[reportOptionalMemberAccess]
-        axes.set_xlabel("gradient updates, + refinement iterations")
 
 
 def _count(number: int) -> str:

@@ -2,12 +2,13 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from koz_jax.config.task import TaskConfig
 from koz_jax.evaluation.rollout import CaseResult
-from koz_jax.figures import palette, style
+from koz_jax.figures import palette, style, wording
 from koz_jax.figures.style import Axes, Figure
 
 
@@ -32,38 +33,46 @@ class Points:
     """What is drawn of each case; arrays (cases,)."""
 
     reward: np.ndarray
-    settling_time: np.ndarray  # [s]; ``not_settled_at`` where the case did not settle
+    settling_time: np.ndarray  # [s]; ``beyond`` where the case did not settle
     control_effort: np.ndarray  # [N^2 m^2 s]
     accuracy_deg: np.ndarray  # phi at the end [deg]
     settled: np.ndarray  # bool
     verdict: np.ndarray  # index into ``VERDICTS``
     violated_unsettled: int  # cases with both faults: they count, and are drawn, as violated
-    not_settled_at: float  # [s]
+    times: tuple[float, float]  # [s] the settling times are within
+
+    @property
+    def beyond(self) -> float:
+        """Where on the axis of settling times the cases are that have none, past its break [s]."""
+        return self.times[1] + _STRIP * (self.times[1] - self.times[0])
 
     def of(self, verdict: Verdict) -> np.ndarray:
         """Which cases ended so.  Returns (cases,) bool."""
         return self.verdict == VERDICTS.index(verdict)
 
 
-def points(results: CaseResult, task: TaskConfig) -> Points:
-    """Compute what is drawn.  results: NumPy leaves (cases,).
+# Of the range of settling times: how far past its end the cases are drawn that have none.
+_STRIP = 0.14
 
-    Cases that did not settle are put at twice the maneuver's length: at 200 s for the paper's 100 s.
-    """
+
+def points(results: CaseResult, task: TaskConfig) -> Points:
+    """Compute what is drawn.  results: NumPy leaves (cases,)."""
     settled, violated = np.asarray(results.settled), np.asarray(results.violated)
-    not_settled_at = 2.0 * task.episode_seconds
     failed = np.where(violated, VERDICTS.index(VIOLATED), VERDICTS.index(NOT_SETTLED))
-    return Points(
+    times = np.asarray(results.settling_time)[settled]
+    low, high = (float(times.min()), float(times.max())) if times.size else (0.0, task.episode_seconds)
+    shown = Points(
         reward=np.asarray(results.reward),
-        settling_time=np.where(settled, results.settling_time, not_settled_at),
+        settling_time=np.asarray(results.settling_time),
         control_effort=np.asarray(results.control_effort),
         # A logarithmic axis has no place for an exact zero.
         accuracy_deg=np.maximum(np.rad2deg(results.control_accuracy), 1e-6),
         settled=settled,
         verdict=np.where(settled & ~violated, VERDICTS.index(SETTLED), failed),
         violated_unsettled=int(np.sum(violated & ~settled)),
-        not_settled_at=not_settled_at,
+        times=(low, max(high, low + 10.0 * task.step_seconds)),
     )
+    return dataclasses.replace(shown, settling_time=np.where(settled, shown.settling_time, shown.beyond))
 
 
 def write(folder: Path, results: CaseResult, task: TaskConfig, title: str = "") -> list[Path]:
@@ -86,7 +95,8 @@ def draw_samples(shown: Points, title: str = "") -> Figure:
     for axes, (label, values) in zip(panels, _metrics(shown).items(), strict=True):
         _scatter(axes, numbers, values, shown)
         axes.set_ylabel(label)
-    _name_not_settled(panels[1], shown)
+        style.value_ticks(axes.yaxis, 6)
+    _break_off_unsettled(panels[1], shown, "y")
     panels[2].set(xlabel="sample number [-]", xlim=(-0.01 * len(numbers), 1.01 * len(numbers)))
     _finish(figure, shown, title)
     return figure
@@ -101,6 +111,10 @@ def draw_relations(shown: Points, title: str = "") -> Figure:
     for axes, (xlabel, x, ylabel, y) in zip(figure.subplots(1, 3), pairs, strict=True):
         _scatter(axes, x, y, shown)
         axes.set(xlabel=xlabel, ylabel=ylabel)
+        style.value_ticks(axes.xaxis)
+        style.value_ticks(axes.yaxis, 6)
+        if x is times:
+            _break_off_unsettled(axes, shown, "x")
     _finish(figure, shown, title)
     return figure
 
@@ -120,15 +134,17 @@ def draw_accuracy(shown: Points, limit_deg: float, title: str = "") -> Figure:
         axes.set(ylabel=r"pointing error $\varphi$ at the end [deg]", yscale="log")
         label = f"accuracy asked for, {limit_deg:g} deg" if axes is everything else None
         axes.axhline(limit_deg, color=palette.BLACK, linewidth=1.0, linestyle="--", label=label)
+        style.decade_ticks(axes.yaxis)
     _finish(figure, shown, title)
     return figure
 
 
 def _metrics(shown: Points) -> dict[str, np.ndarray]:
+    unit = wording.effort_unit(float(np.max(shown.control_effort, initial=0.0)))
     return {
         "reward [-]": shown.reward,
         "settling time [s]": shown.settling_time,
-        "control effort [N² m² s]": shown.control_effort,
+        f"control effort [{unit.name}]": unit.factor * shown.control_effort,
     }
 
 
@@ -152,12 +168,23 @@ def _scatter(axes: Axes, x: np.ndarray, y: np.ndarray, shown: Points, chosen: np
         )
 
 
-def _name_not_settled(axes: Axes, shown: Points) -> None:
-    """Say on the axis of settling times that one of them is none."""
-    if not shown.settled.all():
-        axes.axhline(shown.not_settled_at, color=palette.GREY, linewidth=0.8, linestyle=":", zorder=1)
-        note = f"did not settle: drawn at {shown.not_settled_at:g} s"
-        axes.annotate(note, (0.0, shown.not_settled_at), xytext=(8, -11), textcoords="offset points", fontsize=7.5)
+def _break_off_unsettled(axes: Axes, shown: Points, which: Literal["x", "y"]) -> None:
+    """Break the axis of settling times where these end, and name the strip behind: cases that never settled."""
+    if shown.settled.all():
+        return
+    (low, high), span = shown.times, shown.times[1] - shown.times[0]
+    edge, end = high + 0.5 * _STRIP * span, high + 1.5 * _STRIP * span
+    axis = axes.yaxis if which == "y" else axes.xaxis
+    ticks = [tick for tick in axis.get_major_locator().tick_values(low, high) if low - 0.05 * span <= tick < edge]
+    axis.set_ticks([*ticks, shown.beyond], [*(f"{tick:g}" for tick in ticks), "never"])
+    axes.set(**{f"{which}lim": (low - 0.05 * span, end)})
+    (axes.axhspan if which == "y" else axes.axvspan)(edge, end, color=palette.GREY, alpha=0.12, linewidth=0, zorder=0)
+    # Two strokes across the axis, as where paper is torn.
+    place = (edge - low + 0.05 * span) / (end - low + 0.05 * span)
+    for shift in (-0.012, 0.012):
+        at = np.array([place - 0.01 + shift, place + 0.01 + shift]), np.array([-0.012, 0.012])
+        x, y = at if which == "x" else at[::-1]
+        axes.plot(x, y, transform=axes.transAxes, color=palette.BLACK, linewidth=0.8, clip_on=False, zorder=5)
 
 
 def _finish(figure: Figure, shown: Points, title: str) -> None:
@@ -173,5 +200,7 @@ def _finish(figure: Figure, shown: Points, title: str) -> None:
         )
         handles.insert(VERDICTS.index(verdict), shape)
     figure.suptitle(title)
-    figure.legend(handles=handles, loc="outside lower center", ncols=3 if len(handles) == 3 else 2)
+    # Three beside each other where they have room.
+    columns = 3 if len(handles) == 3 and (figure.get_figwidth() > 8.0 or not shown.violated_unsettled) else 2
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns)
     figure.align_ylabels()

@@ -10,7 +10,8 @@ from koz_jax.figures.style import Axes, Figure
 
 _PIXELS = 800  # of the shaded sphere
 
-_NOTE = "x, y, z: inertial axes; grid every 30°; dashed: on the far side"
+_NOTE = "x, y, z: inertial axes; grid every 30°"
+_DASHED = "; dashed: on the far side"
 
 
 @style.look()
@@ -25,7 +26,9 @@ def draw(history: History, task: TaskConfig, title: str = "") -> Figure:
     mark(axes, traces.view, traces.trace_N[-1], "o", palette.TARGET, f"end, after {task.episode_seconds:g} s")
     figure.suptitle(title)
     figure.legend(loc="outside lower center", ncols=2, handlelength=2.4)
-    axes.text(0.5, -0.02, _NOTE, transform=axes.transAxes, ha="center", va="top", fontsize=7.5, color=palette.GREY)
+    lines_N = [traces.trace_N, traces.shortest_N, *traces.circles_N]
+    note = _NOTE + _DASHED * any(_is_dashed(traces.view, line_N) for line_N in lines_N)
+    axes.text(0.5, -0.02, note, transform=axes.transAxes, ha="center", va="top", fontsize=7.5, color=palette.GREY)
     return figure
 
 
@@ -39,9 +42,12 @@ def draw_scene(axes: Axes, traces: SphereTraces, pixels: int = _PIXELS) -> None:
         front, _ = geometry.front_and_back(traces.view.project(line))
         axes.plot(*front.T, color="#9A9A9A", linewidth=0.4, zorder=1)
     _draw_axes_of_space(axes, traces.view)
-    for zone, circle in zip(traces.zones, traces.circles_N, strict=True):
-        label = f"keep-out zone, half angle {np.rad2deg(zone.half_angle):.1f}°"
-        draw_line(axes, traces.view, circle, palette.ZONE, 1.8, label)
+    for name, zone, circle in zip(geometry.zone_names(traces.zones), traces.zones, traces.circles_N, strict=True):
+        draw_line(
+            axes, traces.view, circle, palette.ZONE, 1.8, f"{name}, half angle {np.rad2deg(zone.half_angle):.1f}°"
+        )
+        if len(traces.zones) > 1:
+            _number_zone(axes, traces.view, zone, name.removeprefix("zone "))
     label = f"shortest path ({np.rad2deg(traces.deviation):.0f}° rotation)"
     draw_line(axes, traces.view, traces.shortest_N, palette.SHORTEST, 1.4, label)
     axes.set(xlim=(-1.13, 1.13), ylim=(-1.13, 1.13), aspect="equal")
@@ -69,6 +75,23 @@ def draw_line(axes: Axes, view: View, line_N: np.ndarray, color: str, width: flo
     axes.plot(*front.T, color=color, linewidth=width, label=label, zorder=3)
 
 
+def _is_dashed(view: View, line_N: np.ndarray) -> bool:
+    """Whether ``draw_line`` dashes any of a line."""
+    return bool(np.isfinite(geometry.front_and_back(view.project(line_N))[1]).any())
+
+
+def _number_zone(axes: Axes, view: View, zone: Zone, number: str) -> None:
+    """Write a zone's number where most of the zone is seen; faint if all of it is on the far side."""
+    shares = np.linspace(0.0, 1.0, 9)
+    inside = np.concatenate([geometry.zone_circle(Zone(zone.axis_N, share * zone.half_angle), 37) for share in shares])
+    seen = view.project(inside)
+    is_front = seen[:, 2] >= 0.0
+    right, up = seen[is_front if is_front.any() else slice(None), :2].mean(axis=0)
+    text = axes.text(right, up, number, ha="center", va="center", fontsize=11, fontweight="bold", color="#7A3500")
+    text.set(alpha=1.0 if is_front.any() else 0.45, zorder=6)
+    text.set_path_effects([style.halo()])
+
+
 def mark(axes: Axes, view: View, point_N: np.ndarray, marker: str, color: str, label: str) -> None:
     """Mark a direction; faint on the far side.  point_N: (3,)."""
     right, up, depth = view.project(point_N)
@@ -93,7 +116,7 @@ def _draw_axes_of_space(axes: Axes, view: View) -> None:
     """Draw the inertial axes, from the sphere's surface outwards."""
     for name, axis_N in zip("xyz", np.eye(3), strict=True):
         right, up, depth = view.project(axis_N)
-        color, zorder = (palette.BLACK, 4) if depth >= 0.0 else (palette.GREY, 0)
+        color, zorder = (palette.BLACK, 4) if depth >= 0.0 else (palette.GREY, -1)
         stem = np.array([1.0, 1.08])
         axes.plot(right * stem, up * stem, color=color, linewidth=0.9, zorder=zorder)
         axes.text(1.13 * right, 1.13 * up, name, color=color, style="italic", ha="center", va="center", zorder=zorder)

@@ -11,10 +11,13 @@ from koz_jax.storage import files
 
 try:
     import matplotlib
+    from matplotlib import ticker
     from matplotlib.axes import Axes as Axes
+    from matplotlib.axis import Axis as Axis
     from matplotlib.backends.backend_agg import FigureCanvasAgg as FigureCanvasAgg
     from matplotlib.figure import Figure as Figure
     from matplotlib.lines import Line2D as Line2D
+    from matplotlib.patheffects import withStroke
 except ImportError as error:
     raise missing_extra(error, "matplotlib", "viz") from None
 
@@ -70,6 +73,23 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     return list(contents)
 
 
-def short_name(agent: str) -> str:
-    """Name of an agent for a title: a shipped one's own, or the last part of a folder."""
-    return Path(agent).resolve().name or agent
+def value_ticks(axis: Axis, most: int = 5) -> None:
+    """Put at most so many labelled intervals on an axis; very small and very large numbers share a power of ten."""
+    axis.set_major_locator(ticker.MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]))
+    formatter = ticker.ScalarFormatter(useOffset=False, useMathText=True)
+    formatter.set_powerlimits((-3, 5))
+    axis.set_major_formatter(formatter)
+
+
+def decade_ticks(axis: Axis) -> None:
+    """Write all numbers of a logarithmic axis in one form: plain over few decades, powers of ten over many."""
+    low, high = sorted(axis.get_view_interval())
+    are_many = high > 1e4 * low or low < 1e-4
+    axis.set_major_locator(ticker.LogLocator(subs=(1.0,) if high > 100.0 * low else (1.0, 2.0, 5.0)))
+    axis.set_major_formatter(ticker.LogFormatterMathtext() if are_many else ticker.FormatStrFormatter("%g"))
+    axis.set_minor_formatter(ticker.NullFormatter())
+
+
+def halo() -> withStroke:
+    """Make a white rim around text, which keeps it readable on lines."""
+    return withStroke(linewidth=2.5, foreground="white", alpha=0.8)

@@ -1,6 +1,7 @@
 """Layout of a run folder.
 
 - ``config.json``: resolved configuration; written last when a run begins, so what has one has a checkpoint too
+- ``command.txt``: the command line that began it, where there was one
 - ``metrics.csv``: training curves; ``tensorboard/`` has the same, and ``timing.csv`` what depends on the machine
 - ``checkpoints/``: the two newest whole training states, replay buffer included, named by the updates done; a third is
   there while it is being written
@@ -38,6 +39,11 @@ class RunFolder:
         """Resolved configuration."""
         return self.path / "config.json"
 
+    @property
+    def command(self) -> Path:
+        """The command line that began the run; there is none where it was begun from Python."""
+        return self.path / "command.txt"
+
     def checkpoint(self, done: int) -> Path:
         """Whole training state after so many updates and refinement iterations."""
         return self.path / "checkpoints" / f"{done:010d}"
@@ -54,6 +60,30 @@ class RunFolder:
         for path in [*unfinished, *self.checkpoints()]:
             if path not in kept:
                 shutil.rmtree(path, ignore_errors=True)
+
+    @property
+    def size(self) -> int:
+        """What the folder takes [bytes]."""
+        return sum(path.stat().st_size for path in self.path.rglob("*") if path.is_file())
+
+    def trim(self) -> int:
+        """Remove what only a resume, or another run that starts from this one, needs.  Returns the bytes set free.
+
+        Raises:
+            SettingsError: the run is not finished, or under way.
+
+        """
+        length, found = self.read_config("run").length, self.checkpoints()
+        if found and int(found[0].name) < length:
+            raise SettingsError(
+                f"run: {self.path} is not finished ({int(found[0].name)} of {length} updates and iterations); it needs"
+                " its checkpoints to be resumed"
+            )
+        with FolderLock(self.path):
+            before = self.size
+            for folder in ("checkpoints", "snapshots"):
+                shutil.rmtree(self.path / folder, ignore_errors=True)
+            return before - self.size
 
     @property
     def evaluation(self) -> Path:
@@ -124,10 +154,22 @@ class RunFolder:
         """Write the configuration of a run that has begun."""
         files.write_text(self.config, config.to_json())
 
-    def read_config(self) -> TrainConfig:
-        """Read the configuration of an existing run."""
+    def write_command(self, command: str) -> None:
+        """Write the command line that began the run, if there was one."""
+        if command:
+            files.write_text(self.command, command + "\n")
+
+    def read_command(self) -> str:
+        """Read the command line that began the run; empty where there was none."""
+        try:
+            return self.command.read_text(encoding="utf-8").strip()
+        except (OSError, UnicodeDecodeError):
+            return ""
+
+    def read_config(self, name: str = "resume") -> TrainConfig:
+        """Read the configuration of an existing run.  name: the setting that gave the folder, for the message."""
         if not os.path.isfile(self.config):
-            raise SettingsError(f"resume: {self.path} is not a run folder (it has no {self.config.name})")
+            raise SettingsError(f"{name}: {self.path} is not a run folder (it has no {self.config.name})")
         try:
             return TrainConfig.model_validate(files.read_json(self.config))
         except ValidationError as error:

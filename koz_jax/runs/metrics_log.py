@@ -41,6 +41,7 @@ class MetricsLog:
         self._timing = folder / "timing.csv"
         self._lines = [text]
         self._columns: list[str] = text.partition("\n")[0].split(",") if text else []
+        self._resumed = bool(text)
         with _writing(folder):
             if text:
                 files.write_text(self._path, text)
@@ -56,6 +57,8 @@ class MetricsLog:
     def write(self, done: int, values: Mapping[str, float], times: Mapping[str, float]) -> None:
         """Append one row.  The first row of a run names all columns (nan leaves a cell empty), later ones some.
 
+        A log that is gone on with keeps its columns: what an older version did not log yet is left out of the file.
+
         times: what depends on the machine's speed.
 
         Raises:
@@ -66,7 +69,7 @@ class MetricsLog:
             self._columns = ["updates", *values]
             self._lines.append(_append(self._path, self._columns))
         unknown = values.keys() - self._columns
-        if unknown:
+        if unknown and not self._resumed:
             raise KeyError(f"columns of {self._path} do not include {sorted(unknown)}")
         shown = {name: f"{value:.9g}" for name, value in values.items() if math.isfinite(value)}
         self._lines.append(_append(self._path, [str(done), *(shown.get(name, "") for name in self._columns[1:])]))

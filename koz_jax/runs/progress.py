@@ -1,30 +1,135 @@
-"""The progress bar of a training run."""
+"""The progress bar of a training run, in time over all stages: what they took so far tells what they still take.
 
+Work that was not measured yet is set against what was, by ratios that hold roughly everywhere: one iteration of
+refinement costs as much as a hundred updates, an evaluation as much as an update for every 20 of its cases.
+"""
+
+import dataclasses
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from typing import Self
 
 from tqdm import tqdm
 
+from koz_jax.evaluation.digits import significant
 from koz_jax.evaluation.summary import Summary
 from koz_jax.runs import stages
-from koz_jax.runs.stages import Stage
+from koz_jax.runs.stages import Refinement, Stage
+
+# Updates that take as long as an iteration of refinement over so many steps, as in the fast preset.
+_UPDATES_PER_ITERATION, _STEPS_PER_ITERATION = 100.0, 128 * 300
+_UPDATES_PER_CASE = 0.05
+
+
+@dataclasses.dataclass
+class _Measured:
+    """What one kind of work took.  The first time includes compilation, and counts only while it is the only one."""
+
+    first: float = 0.0  # [s] of one
+    seconds: float = 0.0
+    count: int = 0
+
+    def add(self, seconds: float, count: int) -> None:
+        if not self.first:
+            self.first = seconds / count
+        else:
+            self.seconds += seconds
+            self.count += count
+
+    @property
+    def each(self) -> float:
+        """[s] of one; 0 before there was any."""
+        return self.seconds / self.count if self.count else self.first
+
+
+def weight(stage: Stage) -> float:
+    """Updates that one update, or one iteration, of a stage costs as much as."""
+    if not isinstance(stage, Refinement):
+        return 1.0
+    steps = stage.config.refine.scenarios * stage.config.refine_steps
+    return _UPDATES_PER_ITERATION * steps / _STEPS_PER_ITERATION
+
+
+def work(planned: Sequence[Stage], done: int) -> float:
+    """Work until ``done``, in updates: what several runs have done can be summed up."""
+    return sum(weight(stage) * min(max(done - stage.start, 0), stage.length) for stage in planned)
+
+
+class TimeEstimate:
+    """Time spent and left of all stages, evaluations included."""
+
+    def __init__(self, planned: Sequence[Stage]) -> None:
+        """Know nothing yet.  planned: all stages of the run."""
+        self._planned = planned
+        self._stages = {stage.title: _Measured() for stage in planned}
+        self._evaluation = _Measured()
+
+    def computed(self, stage: Stage, count: int, seconds: float) -> None:
+        """Take note that so many updates or iterations of a stage took so long."""
+        self._stages[stage.title].add(seconds, count)
+
+    def evaluated(self, seconds: float) -> None:
+        """Take note that an evaluation took so long."""
+        self._evaluation.add(seconds, 1)
+
+    def left(self, done: int) -> float | None:
+        """Time [s] that is left at ``done``; None while nothing was measured."""
+        return self._between(done, self._planned[-1].end) if self._per_update else None
+
+    def share(self, done: int) -> float:
+        """Share of the time that is behind at ``done``, from 0 to 1."""
+        behind, ahead = self._between(0, done), self._between(done, self._planned[-1].end)
+        return behind / (behind + ahead)
+
+    @property
+    def _per_update(self) -> float:
+        """[s] by the latest stage that was measured; 0 if none was."""
+        known = [self._stages[stage.title].each / weight(stage) for stage in self._planned]
+        return next(filter(None, reversed(known)), 0.0)
+
+    def _between(self, begin: int, end: int) -> float:
+        """Time [s] from one count to another; in units of an update while nothing was measured."""
+        per_update = self._per_update or 1.0
+        total = 0.0
+        for stage in self._planned:
+            count = min(end, stage.end) - max(begin, stage.start)
+            if count > 0:
+                total += count * (self._stages[stage.title].each or weight(stage) * per_update)
+                evaluations = stage.evaluations_between(max(begin, stage.start), min(end, stage.end))
+                guessed = _UPDATES_PER_CASE * stage.config.eval_cases * per_update
+                total += evaluations * (self._evaluation.each or guessed)
+        return total
 
 
 class Progress:
-    """Updates (then refinement iterations) done, their rate, time left, and the last evaluation."""
+    """The share of the run's time that is behind, the time left, the stage, and the last evaluation."""
 
-    def __init__(self, planned: Sequence[Stage], done: int, *, enabled: bool) -> None:
-        """Show the bar of a run with ``done`` updates and refinement iterations done.  planned: all of its stages."""
+    def __init__(
+        self,
+        planned: Sequence[Stage],
+        done: int,
+        *,
+        enabled: bool,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        """Show the bar of a run with ``done`` updates and refinement iterations done.
+
+        planned: all of its stages; clock: tells the time [s].
+        """
         self._stages = planned
+        self._done = done
+        self._clock = clock
+        self._mark = clock()
+        self._evaluated = ""
+        self.estimate = TimeEstimate(planned)
         self._bar = tqdm(
-            total=planned[-1].end,
-            initial=done,
-            unit="update",
+            total=1.0,
+            initial=self.estimate.share(done),
             file=sys.stderr,
             disable=not enabled,
             dynamic_ncols=True,
-            smoothing=0.1,
+            bar_format="{desc}: {percentage:3.0f}%|{bar}| [{elapsed}{postfix}]",
         )
 
     def __enter__(self) -> Self:
@@ -43,17 +148,36 @@ class Progress:
         self._bar.write(f"warning: {text}", file=sys.stderr)
 
     def compiling(self) -> None:
-        """Say that the first chunk has to be compiled."""
+        """Say that the first chunk has to be compiled; time counts from now on."""
         self._bar.set_description("compiling (seconds the first time, cached afterwards)")
+        self._mark = self._clock()
 
     def advance(self, done: int) -> None:
-        """Move to ``done`` updates and refinement iterations."""
-        self._bar.set_description(stages.before(self._stages, done).title, refresh=False)
-        self._bar.update(done - self._bar.n)
+        """Move to ``done`` updates and refinement iterations, all of one stage since the last time."""
+        stage = stages.before(self._stages, done)
+        if done > self._done:
+            self.estimate.computed(stage, done - self._done, self._seconds())
+        self._done = done
+        self._bar.set_description(f"{stage.title} {done - stage.start}/{stage.length}", refresh=False)
+        self._show()
 
     def evaluated(self, summary: Summary) -> None:
-        """Show an evaluation."""
-        self._bar.set_postfix_str(
-            f"success {summary.success_rate:.1%}, settled after {summary.settling_time_mean:.1f} s,"
-            f" effort {summary.control_effort_mean:.0f}"
+        """Show an evaluation, which followed on what was done before."""
+        self.estimate.evaluated(self._seconds())
+        self._evaluated = (
+            f", success {summary.success_rate:.1%}, settled after {significant(summary.settling_time_mean, 1)} s,"
+            f" effort {significant(summary.control_effort_mean, 0)}"
         )
+        self._show()
+
+    def _seconds(self) -> float:
+        """Time since the last call [s]."""
+        before, self._mark = self._mark, self._clock()
+        return self._mark - before
+
+    def _show(self) -> None:
+        left = self.estimate.left(self._done)
+        time_left = "" if left is None else f"{tqdm.format_interval(left)} left"
+        self._bar.set_postfix_str(time_left + self._evaluated, refresh=False)
+        self._bar.n = self.estimate.share(self._done)
+        self._bar.refresh()

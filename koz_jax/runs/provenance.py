@@ -1,11 +1,11 @@
 """Where an agent comes from: version and commit of the code, settings, command."""
 
 import subprocess
-from importlib import metadata
 from pathlib import Path
 
 from koz_jax.agents.record import Provenance
 from koz_jax.config.training import TrainConfig
+from koz_jax.config.version import version
 
 _PACKAGE = Path(__file__).parents[1]
 
@@ -22,14 +22,6 @@ def collect(config: TrainConfig, command: str) -> Provenance:
         config_sha256=config.sha256,
         seed=config.seed,
     )
-
-
-def version() -> str:
-    """Version of the package, as ``koz_jax.__version__``."""
-    try:
-        return metadata.version("koz_jax")
-    except metadata.PackageNotFoundError:
-        return "0+uninstalled"
 
 
 def commit(package: Path = _PACKAGE) -> str:

@@ -24,13 +24,17 @@ from koz_jax.agents.record import find_agent
 from koz_jax.config.training import TrainConfig
 from koz_jax.errors import DamagedFileError, PeerProcessError, SettingsError, explain
 from koz_jax.evaluation import monte_carlo
+from koz_jax.evaluation.digits import significant
 from koz_jax.evaluation.summary import Summary, summarise
+from koz_jax.runs import progress as progress_bar
 from koz_jax.runs import stages
 from koz_jax.runs.folder import RunFolder
 from koz_jax.runs.interrupt import GracefulShutdown
 from koz_jax.runs.trainer import checked_source
 from koz_jax.storage import files
 from koz_jax.storage.lock import FolderLock
+
+_BAR = "{l_bar}{bar}| [{elapsed}<{remaining}]"
 
 # Shown while it is waited for the workers.
 _POLL_S = 0.5
@@ -49,6 +53,7 @@ class Plan(BaseModel):
     config: TrainConfig  # of the first seed
     seeds: int
     start_from: str | None
+    cases: int = 10_000  # of the table at the end
 
     def folder(self, run: Path, number: int) -> RunFolder:
         """Folder of one of the runs."""
@@ -126,10 +131,13 @@ def train_all(run: Path, plan: Plan, *, progress: bool = True, command: str = ""
         free.put(core)
     with GracefulShutdown() as shutdown, FolderLock(run), concurrent.futures.ThreadPoolExecutor(len(cores)) as pool:
         work = [pool.submit(_train_one, run, plan, number, free, shutdown, command) for number in range(plan.seeds)]
-        with tqdm(total=plan.seeds * plan.config.length, unit="update", disable=not progress) as bar:
+        planned = stages.plan(plan.config)
+        total = plan.seeds * progress_bar.work(planned, plan.config.length)
+        with tqdm(total=total, bar_format=_BAR, disable=not progress) as bar:
             while not all(job.done() for job in work):
                 concurrent.futures.wait(work, _POLL_S)
-                bar.update(sum(_done(plan.folder(run, number)) for number in range(plan.seeds)) - bar.n)
+                done = [_done(plan.folder(run, number)) for number in range(plan.seeds)]
+                bar.update(sum(progress_bar.work(planned, one) for one in done) - bar.n)
         failures = [failure for job in work if (failure := job.result())]
     if failures:
         raise PeerProcessError("\n".join(failures))
@@ -182,7 +190,9 @@ def _train_one(
         return ""
     if process.returncode == STOPPED:
         return f"{folder.path.name}: was told to stop by somebody else; go on with --resume {run}"
-    return f"{folder.path.name}: {errors.strip()[-2000:] or process.returncode}"
+    # What it warned of was told by ``begin``.
+    told = "\n".join(line for line in errors.splitlines() if not line.startswith("warning: "))
+    return f"{folder.path.name}: {told.strip()[-2000:] or process.returncode}"
 
 
 def _communicate(process: subprocess.Popen[str], job: str, shutdown: GracefulShutdown) -> str:
@@ -227,7 +237,8 @@ def table(found: Sequence[SeedResult], cases: int) -> str:
         summary = result.summary
         lines.append(
             f"seed {result.seed:<10} {result.score:7.1f} {summary.success_rate:8.2%} {summary.violation_rate:9.2%}"
-            f" {summary.non_settled_rate:12.2%} {summary.settling_time_mean:18.2f} {summary.control_effort_mean:17.2f}"
+            f" {summary.non_settled_rate:12.2%} {significant(summary.settling_time_mean, 2):>18}"
+            f" {significant(summary.control_effort_mean, 2):>17}"
             f"{'  best' if result.score == best else ''}"
         )
     return "\n".join(lines)

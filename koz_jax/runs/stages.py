@@ -64,6 +64,24 @@ class Stage(abc.ABC):
         """Whether the policy is evaluated, and a checkpoint made, at ``done``; in any case at the end."""
         return done == self.end or (done - self.eval_from) % self.eval_every == 0
 
+    def evaluations_between(self, begin: int, end: int) -> int:
+        """Number of evaluations after ``begin`` up to ``end``, both within the stage."""
+
+        def due(done: int) -> int:
+            return (done - self.eval_from) // self.eval_every
+
+        at_the_end = end == self.end > begin and (end - self.eval_from) % self.eval_every != 0
+        return due(end) - due(begin) + at_the_end
+
+    @property
+    def improves_on_the_one_before(self) -> bool:
+        """Whether it polishes the agent of the stage before, which stays the best until one is better."""
+        return False
+
+    def is_in_vain(self, best_at: int) -> bool:
+        """Whether the stage gave no better agent.  best_at: when the best was taken."""
+        return self.improves_on_the_one_before and best_at <= self.start
+
     @property
     def is_of_zones(self) -> bool:
         """Whether its agents are to avoid zones."""
@@ -143,6 +161,11 @@ class Learning(Stage):
 
 class Refinement(Stage):
     """Polishing the best policy of the phase before by first-order gradients."""
+
+    @property
+    def improves_on_the_one_before(self) -> bool:
+        """It does."""
+        return True
 
     @property
     def rewarded_as_at(self) -> int:

@@ -11,9 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from koz_jax.agents.agent import Agent
+from koz_jax.config import plausibility
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.task import check_feasible
 from koz_jax.config.training import TrainConfig
+from koz_jax.config.version import version
 from koz_jax.control.policy import PolicyController
 from koz_jax.errors import SettingsError
 from koz_jax.evaluation import cases
@@ -57,7 +59,7 @@ def train(
         devices: divide the environments and the replay buffer among so many devices of this process.  Several
             processes (see ``runtime.join``) divide them among the devices of all; all get the same arguments and need
             a folder that all of them see, and the first one writes.
-        command: the command line, where there is one; the records of the agents note it.
+        command: the command line, where there is one; the folder and the records of the agents keep it.
 
     Returns:
         The best agent of the last phase, or None if the run was interrupted (its checkpoint is then up to date).
@@ -73,9 +75,9 @@ def train(
     folder = RunFolder(Path(run))
     # All of several processes come here, so that they can say it together.
     processes.all_or_none(lambda: sharding.check(config, devices))
-    alike = (config, resume, start_from and str(start_from), devices, provenance.version())
+    alike = (config, resume, start_from and str(start_from), devices, version())
     processes.assert_equal_across_processes("settings", alike)
-    opening = _resumed(folder, config) if resume else _begun(folder, config, start_from)
+    opening = _resumed(folder, config) if resume else _begun(folder, config, start_from, command)
     with GracefulShutdown() as shutdown, opening as saved:
         processes.assert_equal_across_processes("checkpoint", (saved.state.done, saved.log))
         shown = progress and processes.is_primary_process()
@@ -102,7 +104,7 @@ def _resumed(folder: RunFolder, config: TrainConfig) -> Iterator[Checkpoint]:
 
 
 @contextlib.contextmanager
-def _begun(folder: RunFolder, config: TrainConfig, start_from: Path | str | None) -> Iterator[Checkpoint]:
+def _begun(folder: RunFolder, config: TrainConfig, start_from: Path | str | None, command: str) -> Iterator[Checkpoint]:
     """A new run, locked, with its first checkpoint; on an error before that nothing is left of it."""
     with contextlib.ExitStack() as stack:
 
@@ -117,6 +119,7 @@ def _begun(folder: RunFolder, config: TrainConfig, start_from: Path | str | None
             if processes.is_primary_process():
                 checkpoint.save(folder.checkpoint(0), state, config)
                 folder.write_config(config)
+                folder.write_command(command)
 
         state = processes.all_or_none(prepare)
         processes.all_or_none(write)
@@ -127,11 +130,13 @@ def checked_source(config: TrainConfig, start_from: Path | str | None) -> RunSta
     """Refuse a run that cannot be.  Returns what it begins with, where that is another run's.
 
     Raises:
-        SettingsError: there is no room for a zone, too little memory, or nothing to begin with where it should be.
+        SettingsError: there is no room for a zone, nothing that can be learned, too little memory, or nothing to begin
+            with where it should be.
         StorageError: what it should begin with is damaged.
 
     """
     check_feasible(config.task, config.eval_max_angle_deg, "eval_max_angle_deg")
+    plausibility.check_training(config)
     _check_memory(config)
     return None if start_from is None else checkpoint.load_source(Path(start_from), config)
 
@@ -222,6 +227,10 @@ class _Run:
             out.snapshot(stage.snapshot, sharding.gather(state))
         if stage.agent_at_end is not None:
             out.agent(stage.agent_at_end, self._best_agent(state, stage))
+        if stage.improves_on_the_one_before:
+            out.agent(stage.agent, self._best_agent(state, stage))  # which now tells how much was tried
+        if stage.is_in_vain(int(state.best_at)):
+            self.bar.note(f"{stage.title}: gave no better agent; kept the one of update {int(state.best_at)}")
         following = stages.after(self.stages, stage.end)
         return state if following is None else following.begin_from(state)
 
@@ -244,6 +253,11 @@ class _Run:
     def _best_agent(self, state: RunState, stage: Stage) -> Agent:
         """The best agent so far."""
         updates, refinements = stages.split(self.stages, int(state.best_at))
-        taken = {"phase": stage.phase, "updates": updates, "refinements": refinements}
+        taken = {
+            "phase": stage.phase,
+            "updates": updates,
+            "refinements": refinements,
+            "refinements_tried": int(state.refine.iterations),
+        }
         controller = PolicyController(state.best.averaged_policy, self.config.network)
         return Agent(controller, self.config.task, self.provenance.model_copy(update=taken), str(self.folder.path))

@@ -89,6 +89,11 @@ def fly(
     return Maneuver(label or agent.name, flown, history, result)
 
 
+def same_spacecraft(maneuvers: list[Maneuver]) -> bool:
+    """Whether all maneuvers are of one spacecraft; otherwise they compare nothing."""
+    return all(maneuver.task.spacecraft == maneuvers[0].task.spacecraft for maneuver in maneuvers)
+
+
 def clock(maneuvers: list[Maneuver], seconds: float | None = None) -> Clock:
     """Choose the frames of a page.
 
@@ -108,13 +113,21 @@ def clock(maneuvers: list[Maneuver], seconds: float | None = None) -> Clock:
 
 
 def frames(maneuver: Maneuver, at: Clock) -> Frames:
-    """Pick the instants of the clock; a maneuver that is over stays as it ended."""
-    instants = np.minimum(np.rint(at.times / maneuver.task.step_seconds).astype(int), maneuver.steps)
+    """Take the instants of the clock; a maneuver that is over stays as it ended.
+
+    Between its own steps the attitude and the torque are those of the step before, angles are interpolated.
+    """
+    steps = np.minimum(at.times / maneuver.task.step_seconds, maneuver.steps)
+    instants = np.floor(steps + 1e-6).astype(int)
     history = maneuver.history
+
+    def interpolated_deg(angles: np.ndarray) -> np.ndarray:
+        return np.interp(steps, np.arange(maneuver.steps + 1), np.rad2deg(angles))
+
     return Frames(
         q_BN=np.asarray(history.state.body.q_BN)[instants],
         boresight_N=geometry.boresight_trace(history)[instants],
         torque_B=np.asarray(history.torque_B)[instants],
-        margin_deg=np.rad2deg(history.zone_margin)[instants],
-        phi_deg=np.rad2deg(history.pointing_error)[instants],
+        margin_deg=interpolated_deg(np.asarray(history.zone_margin)),
+        phi_deg=interpolated_deg(np.asarray(history.pointing_error)),
     )

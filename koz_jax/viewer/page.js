@@ -75,7 +75,8 @@
   function readoutAt(maneuver, frame) {
     const [margin, error, ...torque] = maneuver.timeline.data.map((curve) => curve.y[frame]);
     const norm = Math.hypot(...torque);
-    return `margin ${margin.toFixed(1)}°, error ${error.toFixed(2)}°, torque ${norm.toFixed(2)} N m`;
+    const digits = norm < 999.5 ? norm.toPrecision(3) : norm.toFixed(0);
+    return `margin ${margin.toFixed(1)}°, error ${error.toFixed(2)}°, torque ${digits} ${maneuver.torqueUnit}`;
   }
 
   async function draw(view) {

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from koz_jax.errors import SettingsError, missing_extra
-from koz_jax.figures import geometry
+from koz_jax.figures import geometry, wording
 from koz_jax.storage import files
-from koz_jax.viewer.maneuver import Clock, Frames, Maneuver, clock, frames
+from koz_jax.viewer.maneuver import Clock, Frames, Maneuver, clock, frames, same_spacecraft
 from koz_jax.viewer.rounding import rounded
 from koz_jax.viewer.scene import scene
 from koz_jax.viewer.timeline import timelines
@@ -37,6 +37,7 @@ def render(maneuvers: list[Maneuver], title: str, seconds: float | None = None) 
     return string.Template(_part("page.html")).substitute(
         title=html.escape(title),
         subtitle=html.escape(describe(maneuvers, at)),
+        caution=html.escape(caution(maneuvers)),
         style=_part("page.css"),
         library=plotly_library(),
         # No text inside the data can end the element that holds it.
@@ -74,11 +75,26 @@ def describe(maneuvers: list[Maneuver], at: Clock) -> str:
     """Tell in one line what is flown, and how much of it is shown."""
     first = maneuvers[0]
     parts = [f"{np.rad2deg(float(first.result.initial_angle)):.1f}° from the target"]
-    parts += [f"zone of {np.rad2deg(zone.half_angle):.1f}° half angle" for zone in geometry.zones(first.history)]
+    zones = geometry.zones(first.history)
+    named = zip(geometry.zone_names(zones), zones, strict=True)
+    parts += [f"{name} of {np.rad2deg(zone.half_angle):.1f}° half angle" for name, zone in named]
     longest = max(maneuver.seconds for maneuver in maneuvers)
     if longest > at.times[-1] + 1e-6:
         parts.append(f"the first {at.times[-1]:g} s of {longest:g} s")
     return ", ".join(parts)
+
+
+def caution(maneuvers: list[Maneuver]) -> str:
+    """Tell what maneuvers side by side do not compare; empty where they do."""
+    if same_spacecraft(maneuvers):
+        return ""
+    others = [flown.label for flown in maneuvers if not _has_own_telescope(flown)]
+    borrowed = f"; the scenario's telescope is not that of {', '.join(map(wording.short_name, others))}" * bool(others)
+    return f"These spacecraft differ, so the maneuvers compare nothing: each has scales of its own{borrowed}."
+
+
+def _has_own_telescope(flown: Maneuver) -> bool:
+    return np.allclose(geometry.boresight(flown.history), flown.task.spacecraft.boresight, atol=1e-5)
 
 
 def _part(name: str) -> str:
@@ -97,10 +113,11 @@ def _content(maneuvers: list[Maneuver], at: Clock) -> dict[str, Any]:
 
 def _maneuver(flown: Maneuver, shown: Frames, timeline: dict[str, Any]) -> dict[str, Any]:
     return {
-        "label": flown.label,
+        "label": wording.short_name(flown.label),
         "verdicts": _verdicts(flown),
         "scene": scene(flown, shown),
         "timeline": timeline,
+        "torqueUnit": wording.torque_unit(flown.task.spacecraft.torque_limits).name,
         "attitude": rounded(shown.q_BN, 5),
     }
 
@@ -117,5 +134,6 @@ def _verdicts(flown: Maneuver) -> list[dict[str, Any]]:
         smallest = f"smallest margin {np.rad2deg(float(result.min_margin)):.1f}°"
         clear = not bool(result.violated)
         found.append({"text": f"{'clear of' if clear else 'looked into'} the zone, {smallest}", "good": clear})
-    found.append({"text": f"effort {float(result.control_effort):.1f} N²m²s", "good": None})
+    effort = float(result.control_effort)
+    found.append({"text": f"effort {wording.effort_unit(effort)(effort)}", "good": None})
     return found

@@ -15,7 +15,7 @@ _BALL_RADIUS = 0.985
 _CAP_RADIUS = 0.992
 
 _POLE = np.array([0.0, 0.0, 1.0])
-_CROSS = 0.05  # half length of its strokes
+_CROSS = 0.11  # half length of its strokes: longer than the dot that begins there
 _EYE = 1.3  # distance of the camera, in units of plotly
 _TILT = 0.3  # tangent of how far the camera stands beside the middle of the path, so that the body is seen too
 
@@ -27,6 +27,8 @@ def scene(maneuver: Maneuver, frames: Frames) -> dict[str, Any]:
     """
     drawn = geometry.sphere_traces(maneuver.history)
     zones = [part for zone in drawn.zones for part in _zone(zone)]
+    if len(drawn.zones) > 1:
+        zones.append(_numbers(drawn.zones))
     fixed = [*_ball(), *zones, _shortest(drawn.shortest_N), _cross("start", drawn.shortest_N[0], palette.SHORTEST)]
     fixed.append(_dot("target", drawn.shortest_N[-1], palette.TARGET, 9))
     moving = [_trail(frames), _dot("now", frames.boresight_N[0], palette.TRACE, 6)]
@@ -76,6 +78,15 @@ def _zone(zone: Zone) -> list[dict[str, Any]]:
         _sheet("zone cone", _CAP_RADIUS * cone, palette.ZONE, 0.15),
         line("zone edge", edge, color=palette.ZONE, width=6),
     ]
+
+
+def _numbers(zones: list[Zone]) -> dict[str, Any]:
+    """The number of each zone, in the middle of its edge: inside the edge from wherever one looks."""
+    x, y, z = rounded(np.stack([max(np.cos(zone.half_angle), 0.3) * zone.axis_N for zone in zones], axis=1))
+    font = {"color": "#4A1F00", "size": 18}
+    trace = {"type": "scatter3d", "mode": "text", "name": "zone numbers", "hoverinfo": "skip", "textfont": font}
+    trace |= {"textposition": "middle center"}
+    return trace | {"text": [f"<b>{number}</b>" for number in range(1, len(zones) + 1)], "x": x, "y": y, "z": z}
 
 
 def _shortest(path: np.ndarray) -> dict[str, Any]:

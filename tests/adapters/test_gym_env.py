@@ -87,9 +87,3 @@ def test_observations_belong_to_the_caller():
     after, rewards, *_ = envs.step(np.zeros((3, 3), np.float32))
     assert not np.any(after == 7.0)
     after[:], rewards[:] = 0.0, 0.0
-
-
-@pytest.mark.parametrize("env", [ReorientationEnv(TASK), ReorientationVectorEnv(3, TASK)])
-def test_options_of_a_reset_are_refused(env):
-    with pytest.raises(SettingsError, match=r"options: a reset takes none, got \{'scenario': 3\}"):
-        env.reset(options={"scenario": 3})

@@ -26,6 +26,7 @@ def learner(env, **settings):
     return SAC("MlpPolicy", env, seed=0, policy_kwargs={"net_arch": [16, 16]}, batch_size=32, device="cpu", **settings)
 
 
+@pytest.mark.slow
 def test_sac_learns_from_true_final_observations():
     env = ReorientationVecEnv(3, TASK)
     model = learner(env, learning_starts=60, gradient_steps=2, buffer_size=1000)
@@ -96,7 +97,7 @@ def test_what_makes_no_sense_here_is_refused():
         with pytest.raises(SettingsError, match=f"seed: must be .*, got {seed}"):
             env.seed(seed)
     env.set_options({"scenario": 3})
-    with pytest.raises(SettingsError, match="options: a reset takes none"):
+    with pytest.raises(SettingsError, match="scenario: must be a Scenario"):
         env.reset()
     assert env.env_is_wrapped(VecMonitor, indices=[0]) == [False]
     assert env.get_attr("num_envs") == [3, 3, 3]

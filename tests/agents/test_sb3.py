@@ -1,10 +1,12 @@
 """Agents of Stable-Baselines3: they decide here as they do there, and what is no such agent is refused."""
 
+import base64
 import json
 import pickle
 import shutil
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -12,10 +14,11 @@ import pytest
 import torch
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize
 from support import tiny
 
 from koz_jax.adapters.sb3_env import ReorientationVecEnv
-from koz_jax.agents.agent import load_agent
+from koz_jax.agents.agent import Agent, load_agent
 from koz_jax.config.task import TaskConfig
 from koz_jax.errors import DamagedFileError, SettingsError
 from koz_jax.task.observation_layout import SIZE, size
@@ -172,3 +175,150 @@ def test_an_agent_of_another_task_is_flown_in_that_task_or_refused(tmp_path):
     assert load_agent(tmp_path / "agent").task == weak
     with pytest.raises(SettingsError, match=r"task: is told for zips of Stable-Baselines3 only"):
         load_agent(tmp_path / "agent", weak)
+
+
+# Observations that VecNormalize has changed
+
+SHORT = TaskConfig(episode_seconds=2.0)
+
+
+@pytest.fixture(scope="module")
+def normalized(tmp_path_factory) -> tuple[Path, SAC, VecNormalize]:
+    """A zip that was trained under VecNormalize, for a few steps."""
+    env = VecNormalize(ReorientationVecEnv(4, SHORT), clip_obs=5.0)
+    model = SAC("MlpPolicy", env, policy_kwargs={"net_arch": [16]}, buffer_size=500, device="cpu", seed=0)
+    model.learn(200)
+    return saved(model, tmp_path_factory.mktemp("normalized")), model, env
+
+
+def statistics(env: VecNormalize) -> dict[str, Any]:
+    moments: Any = env.obs_rms
+    return {"mean": moments.mean, "var": moments.var, "epsilon": env.epsilon, "clip": env.clip_obs}
+
+
+def seen_in_flight(count: int) -> np.ndarray:
+    """Observations of maneuvers of the task."""
+    env = ReorientationVecEnv(count, SHORT)
+    env.seed(1)
+    env.reset()
+    return np.asarray(env.step(np.full((count, 3), 0.3, np.float32))[0])
+
+
+def written(found: dict[str, Any], folder: Path, kind: str) -> Any:
+    if kind == "mapping":
+        return found
+    path = folder / f"statistics.{kind}"
+    if kind == "npz":
+        np.savez(path, **found)
+    else:
+        path.write_text(json.dumps({name: np.asarray(value).tolist() for name, value in found.items()}))
+    return path
+
+
+@pytest.mark.parametrize("kind", ["mapping", "npz", "json"])
+def test_statistics_are_folded_into_the_first_layer(kind, normalized, tmp_path, caplog):
+    path, model, env = normalized
+    agent = load_agent(path, SHORT, written(statistics(env), tmp_path, kind))
+    batch = seen_in_flight(300)
+    inside = np.all(np.abs(env.normalize_obs(batch)) < 5.0, axis=1)
+    assert inside.sum() > 100
+    expected, _ = model.predict(np.asarray(env.normalize_obs(batch)), deterministic=True)
+    np.testing.assert_allclose(agent.predict(batch[inside]), expected[inside], rtol=0, atol=2e-5)
+    assert np.abs(load_agent_as_it_is(path).predict(batch) - expected).max() > 0.01
+    agent.save(tmp_path / "ours")
+    np.testing.assert_allclose(load_agent(tmp_path / "ours").predict(batch), agent.predict(batch), atol=1e-6)
+    assert "with the statistics of its observations" in agent.provenance.command
+    assert "clipping at 5 is left out" in caplog.text and "omega_BN_B below " in caplog.text
+    assert "these are not the statistics" not in caplog.text
+
+
+def load_agent_as_it_is(path: Path) -> Agent:
+    """Without what tells of normalisation."""
+    bare = path.with_name("bare.zip")
+    shutil.copy(path, bare)
+    with zipfile.ZipFile(path) as archive:
+        settings = json.loads(archive.read("data"))
+    rewritten(bare, "data", json.dumps({**settings, "_last_obs": None}).encode())
+    return load_agent(bare, SHORT)
+
+
+def test_a_zip_that_was_trained_under_normalisation_is_refused_without_its_statistics(normalized):
+    with pytest.raises(SettingsError, match=r"changed by a wrapper such as VecNormalize.*normalization=\.\.\."):
+        load_agent(normalized[0], SHORT)
+
+
+def test_a_zip_that_does_not_tell_is_taken_with_a_caution(good, normalized, caplog):
+    for load in (lambda: load_agent(good), lambda: load_agent_as_it_is(normalized[0])):
+        caplog.clear()
+        load()
+        assert "does not tell whether its observations were normalised" in caplog.text
+
+
+def test_a_zip_that_was_trained_without_needs_no_statistics_and_takes_none(normalized, tmp_path, caplog):
+    model = SAC("MlpPolicy", ReorientationVecEnv(2, SHORT), policy_kwargs={"net_arch": [8]}, buffer_size=50)
+    model.learn(8)
+    path = saved(model, tmp_path)
+    load_agent(path, SHORT)
+    assert not caplog.records
+    with pytest.raises(SettingsError, match=r"normalization: .* was trained on observations that are not normalised"):
+        load_agent(path, SHORT, statistics(normalized[2]))
+
+
+def test_rewards_alone_may_be_normalised(tmp_path, caplog):
+    env = VecNormalize(ReorientationVecEnv(2, SHORT), norm_obs=False)
+    model = SAC("MlpPolicy", env, policy_kwargs={"net_arch": [8]}, buffer_size=50)
+    model.learn(8)
+    load_agent(saved(model, tmp_path), SHORT)
+    assert not caplog.records
+
+
+def test_statistics_of_something_else_are_told(normalized, caplog):
+    path, _, env = normalized
+    load_agent(path, SHORT, {**statistics(env), "mean": statistics(env)["mean"] + 1.0})
+    assert "these are not the statistics with which" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"mean": np.zeros(15)}, r"normalization, mean: must have shape \(16,\), got \(15,\)"),
+        ({"var": np.full(16, np.nan)}, "normalization, var: must be finite"),
+        ({"var": np.full(16, -1.0)}, "normalization: var must be 0 or more.* got a smallest var of -1"),
+        ({"epsilon": 0.0}, "epsilon and clip above 0"),
+        ({"clip_obs": 10.0}, "normalization: must have mean and var, and may have epsilon and clip, got"),
+    ],
+)
+def test_statistics_that_are_none_are_refused_by_name(change, reason, normalized):
+    with pytest.raises(SettingsError, match=reason):
+        load_agent(normalized[0], SHORT, {**statistics(normalized[2]), **change})
+
+
+def test_files_that_hold_no_statistics_are_refused(normalized, tmp_path):
+    path, _, env = normalized
+    trace = tmp_path / "executed"
+    bomb = tmp_path / "vecnormalize.pkl"
+    bomb.write_bytes(pickle.dumps(_Bomb(trace)))
+    with pytest.raises(SettingsError, match=r"got .*pkl \(a pickle is never opened\); numpy\.savez"):
+        load_agent(path, SHORT, bomb)
+    np.savez(tmp_path / "objects.npz", mean=np.array([_Bomb(trace)], dtype=object))
+    (tmp_path / "broken.npz").write_bytes(b"PK")
+    (tmp_path / "broken.json").write_text("{")
+    for name in ("objects.npz", "broken.npz", "broken.json"):
+        with pytest.raises(DamagedFileError, match="cannot be read as statistics"):
+            load_agent(path, SHORT, tmp_path / name)
+    assert not trace.exists()
+    with pytest.raises(SettingsError, match="no such file"):
+        load_agent(path, SHORT, tmp_path / "nowhere.npz")
+    with pytest.raises(SettingsError, match=r"normalization: is told for zips of Stable-Baselines3 only"):
+        load_agent("phase2", normalization=statistics(env))
+
+
+def test_a_pickle_in_the_settings_is_not_executed(normalized, tmp_path):
+    path = Path(shutil.copy(normalized[0], tmp_path / "model.zip"))
+    with zipfile.ZipFile(path) as archive:
+        settings = json.loads(archive.read("data"))
+    trace = tmp_path / "executed"
+    settings["_last_obs"] = {":serialized:": base64.b64encode(pickle.dumps(_Bomb(trace))).decode()}
+    rewritten(path, "data", json.dumps(settings).encode())
+    load_agent(path, SHORT)
+    assert not trace.exists()

@@ -3,6 +3,8 @@
 import csv
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,8 @@ import pytest
 from support import tiny
 
 from koz_jax.cli.evaluate import EvaluateFlags
+from koz_jax.cli.flags import parsing
+from koz_jax.config.task import TaskConfig
 from koz_jax.evaluation import cases
 
 pytestmark = pytest.mark.usefixtures("empty_cwd")
@@ -19,7 +23,8 @@ JSON_KEYS = [
     *("cases", "seed", "agent", "mean_reward", "std_reward", "settling_time_mean", "settling_time_std"),
     *("control_effort_mean", "control_effort_std", "control_accuracy_deg_mean", "control_accuracy_deg_std"),
     *("non_settled_rate", "violation_rate", "success_rate"),
-    *("min_margin_deg", "intervention_rate", "mean_torque_change", "deadlock_rate", "compile_s", "wall_s"),
+    *("min_margin_deg", "intervention_rate", "mean_torque_change", "deadlock_rate", "unsafe_start_rate"),
+    *("compile_s", "wall_s"),
 ]
 
 
@@ -76,6 +81,9 @@ BAD = [
     ("--shield --robust --disturbance-torque 3", ["disturbance_torque: must be below the torque limit of 2.0", "3.0"]),
     ("--inertia-error 1.5", ["inertia_error", "less than 1", "1.5"]),
     ("--controller nobody", ["controller: must be one of pd, potential", "FILE.py:CLASS", "nobody"]),
+    ("--task.step-seconds -1", ["task.step_seconds: Input should be greater than 0 (got -1.0)"]),
+    ("--task.spacecraft.boresight 1 1 0", ["task.spacecraft: boresight must be a unit vector", "(1.0, 1.0, 0.0)"]),
+    ("--task.spacecraft.mass 3", ["--task.spacecraft.mass"]),
     ("--zones 9", ["zones", "less than or equal to 8", "9"]),
     ("--max-rate-deg -1", ["max_rate_deg", "greater than or equal to 0", "-1"]),
 ]
@@ -92,8 +100,6 @@ def test_bad_input_is_refused_by_name_before_anything_happens(capsys, agent, emp
 
 @pytest.mark.parametrize(("word", "count"), [("1e4", 10_000), ("10_000", 10_000), ("12", 12), ("1.2e1", 12)])
 def test_whole_numbers_may_be_written_in_any_way(word, count):
-    from koz_jax.cli.flags import parsing
-
     assert parsing.parse(EvaluateFlags, ["--cases", word], "koz evaluate").cases == count
 
 
@@ -127,7 +133,8 @@ def test_a_damaged_agent_is_refused(capsys, agent):
     assert f"{agent}/record.json: cannot be read as JSON" in refused(capsys, "--agent", agent)
 
 
-def test_help_describes_every_flag(capsys):
+def test_help_describes_every_flag(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")  # wider, it would have two columns
     assert tiny.status("evaluate", "--help") == 0
     # Wrapped lines and their frame do not count.
     text = re.sub(r"[\s│|]", "", capsys.readouterr().out)
@@ -161,7 +168,7 @@ def test_table_json_and_csv_tell_the_same(capsys, run, empty_cwd):
     assert np.mean([row["settled"] == "0" for row in rows]) == report["non_settled_rate"]
 
     assert f"{report['mean_reward']:.2f} +- {report['std_reward']:.2f}" in output
-    assert "7281.91 +- 688.85" in output  # the paper's
+    assert "7281.91" not in output  # the paper's number is of another task
     assert re.search(r"not settled .*100\.00 %  \[\d+\.\d\d, 100\.00\]", output)
     assert re.search(r"compiled in \d+\.\d s, flown in \d+\.\d s", output)
     assert sorted(path.name for path in empty_cwd.iterdir()) == ["x.csv", "x.json"]
@@ -212,6 +219,48 @@ def test_the_command_itself(run, empty_cwd):
     done = tiny.run_python(
         tiny.ROOT / "eval_mc.py", "--agent", run.path, "--cases", 12, "--json", "x.json", cwd=empty_cwd
     )
-    assert (done.returncode, done.stderr) == (0, "")
+    assert done.returncode == 0
+    (warning,) = done.stderr.splitlines()  # two seconds are too short
+    assert warning.startswith("warning: task.spacecraft: a turn by 80 deg takes 11.1 s or more")
     assert "12 cases" in done.stdout
     assert list(json.loads((empty_cwd / "x.json").read_text())) == JSON_KEYS
+
+
+def test_an_agent_flies_ones_own_spacecraft_from_the_command_line(capsys, agent, empty_cwd):
+    """What is given changes the agent's own task and nothing else, and it is told that it was not made for that."""
+    own = ["--task.spacecraft.inertia", *"12 0 0 0 10 0 0 0 8".split(), "--task.spacecraft.torque-limit=0.4"]
+    asked = parsing.parse(EvaluateFlags, [*own, "--task.step_seconds", "0.1"], "koz evaluate")
+    made_for = tiny.untrained_agent()
+    task = asked.task(made_for)
+    assert task == TaskConfig.model_validate(
+        tiny.merged(
+            made_for.task.model_dump(),
+            {"spacecraft": {"inertia": ((12, 0, 0), (0, 10, 0), (0, 0, 8)), "torque_limit": 0.4}},
+        )
+    )
+    assert parsing.parse(EvaluateFlags, [], "koz evaluate").task(made_for) == made_for.task
+    rows = []
+    for name, argv in (("own", own), ("agents", [])):
+        assert tiny.status("evaluate", "--agent", agent, "--cases", tiny.CASES, "--csv", name, *argv) == 0
+        told = capsys.readouterr()
+        assert ("was not made for this: moments of inertia of 12, 10, 8" in told.err) == bool(argv)
+        rows.append(list(csv.DictReader((empty_cwd / name).read_text().splitlines())))
+    assert [row["control_effort_N2m2s"] for row in rows[0]] != [row["control_effort_N2m2s"] for row in rows[1]]
+
+
+def test_a_value_that_is_the_papers_takes_the_place_of_the_agents():
+    asked = parsing.parse(EvaluateFlags, ["--task.episode-seconds", "100"], "koz evaluate")
+    assert tiny.untrained_agent().task.episode_seconds == 2.0
+    assert asked.task(tiny.untrained_agent()).episode_seconds == 100.0
+
+
+@pytest.mark.slow
+def test_a_platform_that_is_not_there_is_named_in_a_line(empty_cwd, agent):
+    for name in ("cuda", "rocm"):
+        environment = tiny.environment() | {"JAX_PLATFORMS": name}
+        command = [sys.executable, "-m", "koz_jax", "evaluate", "--agent", str(agent), "--cases", "2"]
+        done = subprocess.run(command, env=environment, cwd=empty_cwd, capture_output=True, text=True, check=False)
+        if done.returncode == 0:
+            continue  # it is there
+        (line,) = done.stderr.splitlines()
+        assert done.returncode == 2 and line.startswith(f"error: JAX_PLATFORMS: {name!r} cannot be used (")

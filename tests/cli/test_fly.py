@@ -1,6 +1,8 @@
 """``koz fly``, and the figures of ``koz evaluate``: what they write, and what they refuse."""
 
 import csv
+import io
+import json
 import re
 from pathlib import Path
 
@@ -9,6 +11,11 @@ import pytest
 from PIL import Image
 from support import tiny
 
+from koz_jax.cli.flags import parsing
+from koz_jax.cli.fly import FlyFlags
+from koz_jax.config.maneuver_file import load_maneuver
+from koz_jax.config.shield import UncertaintyConfig
+from koz_jax.config.task import TaskConfig
 from koz_jax.evaluation import cases
 
 
@@ -55,6 +62,126 @@ def test_fly_refuses_before_it_flies(name, agent, tmp_path, capsys, monkeypatch)
     output = capsys.readouterr()
     assert output.err.startswith(f"error: {message}") and output.out == ""
     assert sorted(path.name for path in tmp_path.iterdir()) == ["agent", "file"]
+
+
+# --- maneuvers of one's own ---
+
+EXAMPLES = tiny.ROOT / "examples"
+PAPER, CUBESAT = EXAMPLES / "paper.toml", EXAMPLES / "cubesat_6u.toml"
+HALF = (0.7071, 0.0, 0.7071, 0.0)  # a quarter turn about y
+
+
+def numbers(path: Path) -> np.ndarray:
+    return np.loadtxt(io.StringIO(path.read_text()), delimiter=",", skiprows=1)
+
+
+@pytest.mark.slow
+def test_the_papers_file_is_flown_as_the_papers_scenario_is(tmp_path, capsys):
+    ours, papers = tmp_path / "ours", tmp_path / "papers"
+    written = tmp_path / "result.json"
+    assert tiny.status("fly", PAPER, "--out", ours, "--json", written) == 0
+    printed = capsys.readouterr().out
+    assert tiny.status("fly", "--out", papers, "--substeps", 5) == 0
+    first = capsys.readouterr().out.splitlines()[0]
+    # What is printed has three digits, and the file's numbers are rounded a little differently.
+    assert (
+        printed.splitlines()[0].partition(": ")[2].split(", accuracy")[0]
+        == (first.partition(": ")[2].split(", accuracy")[0])
+    )
+    np.testing.assert_allclose(numbers(ours / "history.csv"), numbers(papers / "history.csv"), atol=2e-4)
+    report = json.loads(written.read_text())
+    assert report["settled"] and not report["violated"] and f"written: {written}" in printed
+    assert re.search(r"settling time \[s\] +1\d(\.\d+)? +27\.8\n", printed)
+    assert "published: mean of the paper's Monte Carlo" in printed
+
+
+@pytest.mark.slow
+def test_a_maneuver_is_flown_without_a_file(tmp_path, capsys):
+    """With the spacecraft of a file, and the cone in the way of its first instrument."""
+    argv = ["--from", *HALF, "--to", 1, 0, 0, 0, "--keep-out", 0.7071, 0, 0.7071, 20, "--keep-out", 0, -1, 0, "2e1"]
+    argv += ["--spacecraft", CUBESAT, "--controller", "pd", "--shield", "--json", tmp_path / "x.json"]
+    assert tiny.status("fly", *argv, "--out", tmp_path / "out") == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("a turn of one's own: 90.0 deg") and "flown for 70 s" in printed
+    report = json.loads((tmp_path / "x.json").read_text())
+    assert len(report["margins_deg"]) == 2 and not report["violated"]
+
+
+def parsed(*argv: object) -> FlyFlags:
+    return parsing.parse(FlyFlags, [str(word) for word in argv], "koz fly")
+
+
+def test_the_file_is_given_by_its_place_or_by_a_flag():
+    expected = load_maneuver(PAPER)
+    for argv in ([PAPER], ["--maneuver", PAPER], ["--shield", PAPER], [PAPER, "--agent", "phase1", "--seed", 3]):
+        assert parsed(*argv).own_maneuver == expected
+    assert parsed().own_maneuver is None
+
+
+def test_flags_make_a_maneuver_of_the_agents_spacecraft():
+    found = parsed("--from", *HALF, "--to", 1, 0, 0, 0, "--keep-out", 0, 1.005, 0, 12).own_maneuver
+    assert found is not None and found.task == TaskConfig()
+    assert found.start.attitude == pytest.approx(HALF, abs=1e-5) and found.target.attitude == (1, 0, 0, 0)
+    (cone,) = found.constraints
+    assert (cone.direction, cone.half_angle_deg) == ((0.0, 1.0, 0.0), 12.0)
+
+
+def test_flags_take_the_spacecraft_of_a_file(tmp_path):
+    (tmp_path / "body.toml").write_text(
+        "step_seconds = 0.5\n[spacecraft]\ntorque_limit = [0.1, 0.1, 0.2]\ninertia = [[2, 0, 0], [0, 2, 0], [0, 0, 2]]"
+    )
+    turn = ["--from", *HALF, "--to", 1, 0, 0, 0, "--keep-out", 0, 1, 0, 12, "--spacecraft"]
+    bare = parsed(*turn, tmp_path / "body.toml").own_maneuver
+    assert bare is not None and bare.task.spacecraft.torque_limits == (0.1, 0.1, 0.2)
+    assert bare.task.spacecraft.boresight == (1.0, 0.0, 0.0) and bare.seconds == 80.0
+    whole = parsed(*turn, CUBESAT).own_maneuver
+    assert whole is not None and whole.constraints[0].instrument == "telescope"
+    assert whole.task.spacecraft == load_maneuver(CUBESAT).task.spacecraft
+
+
+def test_errors_come_from_the_file_or_from_flags_and_are_what_robust_withstands(tmp_path):
+    (tmp_path / "mine.toml").write_text(PAPER.read_text() + "\n[errors]\ninertia = 0.1\n")
+    config = parsed(tmp_path / "mine.toml", "--shield", "--robust").config()
+    assert config.uncertainty == UncertaintyConfig(inertia_error=0.1)
+    assert config.shield is not None and config.shield.error_bounds == config.uncertainty
+    assert config.substeps == 5 and parsed(PAPER, "--substeps", 9).config().substeps == 9
+    assert parsed("--json", "x.json").config().substeps == 5 and parsed().config().substeps == 1
+    assert parsed(PAPER, "--inertia-error", 0.2).config().uncertainty == UncertaintyConfig(inertia_error=0.2)
+
+
+TURN = ("--from", 1, 0, 0, 0, "--to", 0, 1, 0, 0)
+REFUSED_TURNS = {
+    "no file": (("no.toml",), "maneuver: no.toml cannot be read: No such file or directory"),
+    "two files": ((PAPER, "--maneuver", PAPER), "maneuver: give one file, got"),
+    "file and flags": ((PAPER, *TURN), "from: give either a maneuver file or --from"),
+    "file and case": ((PAPER, "--case", 1), "case: is of the draw; give either --case or a maneuver, got 1"),
+    "file and paper": ((PAPER, "--scenario", "paper"), "scenario: give either --scenario paper or a maneuver"),
+    "file and draw": ((PAPER, "--zones", 2), "zones: is of the draw, and needs --case; a maneuver of one's own has"),
+    "no target": (("--from", 1, 0, 0, 0), "from: needs --to too"),
+    "no start": (("--to", 1, 0, 0, 0), "to: needs --from too"),
+    "cone alone": (("--keep-out", 1, 0, 0, 20), "keep_out: needs --from and --to"),
+    "body alone": (("--spacecraft", CUBESAT), "spacecraft: needs --from and --to"),
+    "quaternion": (("--from", 1, 1, 0, 0, "--to", 1, 0, 0, 0), "from: must be a unit quaternion, scalar first"),
+    "cone": ((*TURN, "--keep-out", 3, 4, 0, 20), "keep_out.0.direction: must be a unit vector, of length 1"),
+    "half angle": ((*TURN, "--keep-out", 0, 1, 0, 200), "keep_out.0.half_angle_deg: Input should be less than 180"),
+    "start inside": ((*TURN, "--keep-out", 1, 0, 0, 20), "from: must keep every instrument outside its cones"),
+    "no body": ((*TURN, "--spacecraft", "no.toml"), "spacecraft: no.toml cannot be read"),
+    "nobody": ((CUBESAT,), "agent: phase2, which flies by default, was not made for '6U CubeSat, past the Sun' ("),
+    "controller": ((CUBESAT, "--controller", "nobody"), "controller: must be one of pd"),
+    "json": ((PAPER, "--json", "no/x.json"), "json: the folder no of no/x.json does not exist"),
+    "task": ((PAPER, "--task.step-seconds", 0.2), "task: a maneuver of one's own says what flies"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED_TURNS)
+def test_maneuvers_that_cannot_be_flown_are_refused_in_one_line(name, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cases, "_keep_and_evaluate", lambda *_, **__: pytest.fail("something was flown"))
+    argv, message = REFUSED_TURNS[name]
+    assert tiny.status("fly", *argv) == 2
+    output = capsys.readouterr()
+    assert output.err.startswith(f"error: {message}") and output.out == ""
+    assert len(output.err.splitlines()) == 1
 
 
 @pytest.mark.slow

@@ -2,12 +2,19 @@
 
 import csv
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from support import tiny
 
-from koz_jax.control.registry import load_controller
+from koz_jax.config.task import TaskConfig
+from koz_jax.control import from_file
+from koz_jax.control.registry import NamedController, as_task_controller, load_controller
 from koz_jax.errors import SettingsError
+from koz_jax.evaluation.cases import fly_scenario
+from koz_jax.evaluation.monte_carlo import monte_carlo
+from koz_jax.task.scenario import paper_test
 
 MINE = '''
 import jax.numpy as jnp
@@ -150,3 +157,54 @@ def test_what_cannot_fly_is_refused_in_a_line(name, file, monkeypatch):
     assert message.startswith("controller: ") and len(message.splitlines()) == 1
     for words in BAD[name]:
         assert words in message
+
+
+def python(file: Path, name: str) -> Any:
+    """A class of the file, as a program that imports it has it."""
+    return from_file._class(file, name)
+
+
+def test_in_python_a_controller_flies_as_it_is(file):
+    """Without a name or a task it is called by its class, and flies the paper's task."""
+    mine = python(file, "Mine")()
+    task = TaskConfig(episode_seconds=2.0)
+    bare = monte_carlo(mine, tiny.CASES, task=task)
+    named = monte_carlo(NamedController("other", mine, task), tiny.CASES)
+    assert (bare.agent, named.agent) == ("Mine", "other")
+    np.testing.assert_array_equal(bare.results.control_effort, named.results.control_effort)
+    assert as_task_controller(mine).task == TaskConfig()
+    history, _ = fly_scenario(mine, paper_test(), task)
+    assert len(history.zone_margin) == 21
+
+
+PYTHON_BAD = {
+    "Numpy": ["Numpy cannot be traced", "use jax.numpy in place of numpy", "own.py, line"],
+    "Branching": ["cannot be traced", "jax.numpy.where"],
+    "NoTree": ["must be a pytree", "koz_jax.control.base.Memoryless or flax.struct.PyTreeNode"],
+    "TooMany": ["must be 3 real numbers", "(4,)"],
+    "Undecided": ["begin and decide"],
+}
+
+
+@pytest.mark.parametrize("name", PYTHON_BAD)
+def test_in_python_what_cannot_fly_is_refused_in_a_line(name, file):
+    made = python(file, name)()
+    task = TaskConfig(episode_seconds=2.0)
+    for flown in (made, NamedController("mine", made, task)):
+        if name == "Undecided" and flown is not made:
+            continue
+        for fly in (lambda flown=flown: monte_carlo(flown, 2), lambda flown=flown: fly_scenario(flown, paper_test())):
+            with pytest.raises(SettingsError) as refused:
+                fly()
+            message = str(refused.value)
+            assert len(message.splitlines()) == 1
+            for words in PYTHON_BAD[name]:
+                assert words in message
+
+
+def test_what_is_no_controller_at_all_is_refused_by_name(file):
+    with pytest.raises(SettingsError, match=r"must be an object, got the class Mine; give Mine\(\)"):
+        monte_carlo(python(file, "Mine"), 2)
+    for nothing in ("phase2", None, 3):
+        with pytest.raises(SettingsError, match=rf"got {type(nothing).__name__}$"):
+            monte_carlo(nothing, 2)  # pyright: ignore[reportArgumentType]

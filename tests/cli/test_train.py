@@ -1,8 +1,10 @@
 """``koz train`` as a user meets it: its help, its errors, its signals, its output."""
 
+import dataclasses
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -16,6 +18,8 @@ import pytest
 from support import tiny
 
 import koz_jax.runs.trainer
+from koz_jax.agents.agent import load_agent
+from koz_jax.cli import train as train_cli
 from koz_jax.cli.train import TrainFlags, parse
 from koz_jax.config.base import Settings
 from koz_jax.config.presets import PRESETS, preset
@@ -316,3 +320,59 @@ def test_a_finished_run_is_evaluated_again(run, tmp_path, capsys, monkeypatch):
     assert tiny.status("train", "--resume", tmp_path / "run", "--cases", tiny.CASES) == 0
     assert f"{tiny.CASES} cases" in capsys.readouterr().out
     assert files.read_json(RunFolder(tmp_path / "run").evaluation)["cases"] == tiny.CASES
+
+
+def test_a_resumed_run_keeps_the_cases_that_it_was_begun_with(run, tmp_path, capsys, monkeypatch):
+    shutil.copytree(run.path, tmp_path / "run")
+    folder = RunFolder(tmp_path / "run")
+    folder.write_command(f"koz train --preset short --cases={tiny.CASES}.0 --run run")
+    assert tiny.status("train", "--resume", folder.path) == 0
+    shown = capsys.readouterr().out
+    assert files.read_json(folder.evaluation)["cases"] == tiny.CASES
+    assert re.search(rf"{folder.path} takes \d+ MB, most of it to resume from; make it small with: koz trim", shown)
+    assert tiny.status("train", "--resume", folder.path, "--cases", 5) == 0
+    assert files.read_json(folder.evaluation)["cases"] == 5
+
+
+def test_the_command_that_begins_a_run_is_kept_in_its_folder(monkeypatch, tmp_path, capsys):
+    def interrupted(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(train_step, "train_chunk", interrupted)
+    argv = ["--run", str(tmp_path / "run"), *tiny.FLAGS, "--cases", "7"]
+    assert tiny.status("train", *argv) == 130
+    assert RunFolder(tmp_path / "run").read_command() == shlex.join(["koz", "train", *argv])
+
+
+@pytest.mark.usefixtures("no_training")
+def test_units_of_which_nothing_can_be_learned_are_refused(capsys, monkeypatch, empty_cwd):
+    no_shapes(monkeypatch)
+    message = refused(capsys, INERTIA, *"6e7 5e6 1e6 5e6 5e7 2e6 1e6 2e6 7e7".split())
+    assert "task.spacecraft: a turn by 80 deg takes 1.11e+04 s or more" in message and "kg m^2 and N m?" in message
+    assert "never drawn above 88 deg" in refused(capsys, "--task.scenario.max-half-angle-deg", 95)
+    assert list(empty_cwd.iterdir()) == []
+
+
+def test_a_refinement_in_vain_is_told_below_the_table(run, tmp_path, capsys):
+    shutil.copytree(run.path, tmp_path / "run")
+    folder = RunFolder(tmp_path / "run")
+    agent = load_agent(folder.path)
+    for refinements, told in ((0, True), (4, False)):
+        record = agent.provenance.model_copy(update={"updates": 96, "refinements": refinements})
+        train_cli._report(dataclasses.replace(agent, provenance=record), tiny.CONFIG, 5, folder.path)
+        shown = capsys.readouterr().out
+        assert ("refinement did not improve the agent; kept the one of update 96" in shown) == told
+
+
+def test_trim_removes_what_only_a_resume_needs(run, tmp_path, capsys):
+    shutil.copytree(run.path, tmp_path / "seeds" / "seed-0")
+    (tmp_path / "seeds" / "seeds.json").write_text("{}")
+    shutil.copytree(run.path, tmp_path / "run")
+    assert tiny.status("trim", tmp_path / "run", tmp_path / "seeds") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 and all("MB removed" in line and "MB left" in line for line in lines)
+    for folder in (tmp_path / "run", tmp_path / "seeds" / "seed-0"):
+        assert not (folder / "checkpoints").exists() and (folder / "agents" / "phase2").exists()
+    assert tiny.status("trim", tmp_path) == 2
+    assert "run: " in (told := capsys.readouterr().err) and "is not a run folder" in told
+    assert tiny.status("trim") == 2

@@ -34,7 +34,7 @@ def test_command_draws_the_case_of_the_monte_carlo(saved, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert printed.count("deg, ") >= 2 and "maneuver.html" in printed
     (left, right) = content_of(out.read_text())["maneuvers"]
-    assert left["label"] == right["label"] == saved
+    assert left["label"] == right["label"] == "untrained"
     history, _ = fly_case(untrained_agent(), 3, MonteCarloConfig(seed=5))
     np.testing.assert_allclose(left["attitude"][0], history.state.body.q_BN[0], atol=1e-5)
     np.testing.assert_allclose(left["attitude"][-1], history.state.body.q_BN[-1], atol=1e-3)
@@ -87,7 +87,23 @@ def test_controllers_shields_and_zones_are_shown(saved, tmp_path, capsys):
     argv = ["--agent", saved, "--controller", "pd", "--shield", "--case", 3, "--zones", 2, "--out", out]
     assert tiny.status("view", *argv) == 0
     found = content_of(out.read_text())["maneuvers"]
-    assert [maneuver["label"] for maneuver in found] == [f"{saved} + shield", "pd + shield"]
+    assert [maneuver["label"] for maneuver in found] == ["untrained + shield", "pd + shield"]
     for maneuver in found:
         assert sum(trace["name"] == "zone edge" for trace in maneuver["scene"]["data"]) == 2
     assert capsys.readouterr().out.count("stayed clear of the zone") == 2
+
+
+def test_a_maneuver_of_ones_own_is_shown_as_it_is_flown(saved, tmp_path, capsys):
+    """By who is named; where nobody is, by who was made for the spacecraft."""
+    text = (tiny.ROOT / "examples" / "calaon1.toml").read_text()
+    (tmp_path / "mine.toml").write_text(
+        text.replace("step_seconds = 0.2", "step_seconds = 0.2\nduration_seconds = 2.0")
+    )
+    argv = [tmp_path / "mine.toml", "--out", tmp_path / "x.html"]
+    assert tiny.status("view", *argv) == 2
+    assert capsys.readouterr().err.startswith("error: agent: phase2, which flies by default, was not made for '3U")
+    assert tiny.status("view", *argv, "--controller", "pd") == 0
+    (shown,) = content_of((tmp_path / "x.html").read_text())["maneuvers"]
+    assert shown["label"] == "pd"
+    np.testing.assert_allclose(shown["attitude"][0], [0.98019802, 0, 0, 0.1980198], atol=1e-4)
+    assert "3U CubeSat, one cone" in (tmp_path / "x.html").read_text()

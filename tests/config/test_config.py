@@ -11,7 +11,7 @@ from koz_jax.config import presets
 from koz_jax.config.base import Settings, checked, constant, ramp_value
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.shield import ShieldConfig, UncertaintyConfig
-from koz_jax.config.task import SpacecraftConfig, TaskConfig, check_deviations
+from koz_jax.config.task import SpacecraftConfig, TaskConfig, check_deviations, is_paper_task
 from koz_jax.config.training import TrainConfig
 from koz_jax.errors import KozError, SettingsError, explain
 
@@ -241,3 +241,24 @@ def test_settings_of_a_caller_are_refused_with_an_error_of_ours():
         "colour: Extra inputs are not permitted (got 'red')",
     ]
     assert caught.value.__cause__ is None and caught.value.__suppress_context__
+
+
+@pytest.mark.parametrize(
+    ("changes", "papers"),
+    [
+        ({}, True),
+        ({"angle_convention": "half"}, True),
+        ({"scenario": {"infeasible_zone": "shrink"}}, True),
+        ({"spacecraft": {"torque_limit": (2.0, 2.0, 2.0)}}, True),
+        ({"reward": {"progress_tolerance_deg": 0.01}}, True),
+        ({"step_seconds": 0.2}, False),
+        ({"episode_seconds": 50.0}, False),
+        ({"spacecraft": {"torque_limit": 1.0}}, False),
+        ({"spacecraft": {"boresight": (0.0, 0.0, 1.0)}}, False),
+        ({"reward": {"settled_angle_deg": 0.5}}, False),
+        ({"scenario": {"max_zones": 3}}, False),
+        ({"scenario": {"max_rate_deg": 1.0}}, False),
+    ],
+)
+def test_the_papers_numbers_are_of_its_task_only(changes, papers):
+    assert is_paper_task(TaskConfig.model_validate(changes)) == papers

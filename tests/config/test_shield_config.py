@@ -15,7 +15,7 @@ def test_the_older_name_of_the_error_bounds_is_read():
     """Runs and agents of before say ``withstands``; what is written says ``error_bounds``."""
     old = json.dumps({"margin_deg": 0.2, "withstands": ERRORS.model_dump(), "guide_rate_deg": 6.0, "samples": 12})
     read = ShieldConfig.model_validate_json(old)
-    assert read == ShieldConfig(margin_deg=0.2, error_bounds=ERRORS)
+    assert read == ShieldConfig(margin_deg=0.2, error_bounds=ERRORS, guide_rate_deg=6.0)
     written = json.loads(read.model_dump_json())
     assert "withstands" not in written and written["error_bounds"] == ERRORS.model_dump()
     assert ShieldConfig.model_validate(written) == read

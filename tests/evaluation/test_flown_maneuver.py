@@ -202,6 +202,7 @@ def test_what_was_chosen_and_what_is_published_is_told():
     assert row.split()[-2:] == ["-", "207"] and text.endswith("published: PD + CBF")
     assert "flown for" not in text and text.count("camera") == 3
     free = maneuver.describe(SHORT.model_copy(update={"duration_seconds": None}), short())
+    assert "pictures show where camera looks, not tracker" in free and "pictures" not in text
     assert "flown for 120 s: 5 times the fastest half turn, 22.9 s" in free and "published" not in free
 
 

@@ -19,7 +19,7 @@ from koz_jax.config.training import NO_ENCODING
 from koz_jax.errors import SettingsError
 from koz_jax.evaluation import cases
 from koz_jax.evaluation.rollout import CaseResult
-from koz_jax.export.c import _number
+from koz_jax.export.c import C_FILES, _number
 from koz_jax.export.files import export, write_files
 from koz_jax.export.golden import Golden, golden
 from koz_jax.export.library import STRICT, CLibrary
@@ -82,16 +82,25 @@ def test_the_golden_situations_cover_the_envelope(vectors):
 
 
 def test_golden_observations_are_those_of_the_paper(vectors):
-    for situation, observed in zip(vectors.situation[:50], vectors.observation[:50], strict=True):
-        q_BN, omega, q_DN, axis, (half_angle, before) = np.split(situation.astype(np.float64), (4, 7, 11, 14))
-        expected = oracle.observation(q_BN, omega, q_DN, axis, half_angle, before)
+    flipped = 0
+    for situation, before, observed in zip(vectors.situation[:50], vectors.memory, vectors.observation, strict=False):
+        q_BN, omega, q_DN, axis, half_angle = np.split(situation.astype(np.float64), (4, 7, 11, 14))
+        if oracle.product(oracle.conjugate(q_DN), q_BN) @ before < 0.0:
+            q_BN, flipped = -q_BN, flipped + 1
+        expected = oracle.observation(q_BN, omega, q_DN, axis, half_angle[0], before[0])
         np.testing.assert_allclose(observed, expected, rtol=0, atol=5e-6)
+        # One step before, at the same rate.
+        apart = oracle.product(oracle.conjugate(before.astype(np.float64)), observed[:4])
+        np.testing.assert_allclose(2.0 * apart[1:], 0.1 * omega, rtol=1e-3, atol=1e-6)
+    assert 10 < flipped < 40, "attitudes of either sign"
 
 
 @needs_compiler
 def test_c_observes_and_decides_alike(library, vectors):
     # The direction to a zone's axis that the telescope nearly points at is a small difference divided by itself.
-    np.testing.assert_allclose(library.observe(vectors.situation), vectors.observation, rtol=0, atol=2e-5)
+    observed, memories = library.observe(vectors.situation, vectors.memory)
+    np.testing.assert_allclose(observed, vectors.observation, rtol=0, atol=2e-5)
+    np.testing.assert_array_equal(memories, observed[:, :4])
     actions = library.decide(vectors.observation)
     np.testing.assert_allclose(actions, vectors.action, rtol=0, atol=1e-5 * ACTION_RANGE)
     np.testing.assert_array_equal(library.torque(vectors.observation), np.float32(2.0) * actions)
@@ -166,12 +175,13 @@ def test_exports_of_a_policy_that_sees_several_zones(tmp_path):
     other = tiny.untrained_agent(network=network)
     other = dataclasses.replace(other, task=other.task.model_copy(update={"scenario": crowded}))
     drawn = golden(other, 1000, seed=6)
-    assert drawn.situation.shape[1] == 12 + 4 * 4 and drawn.observation.shape[1] == size(3) == 26
+    assert drawn.situation.shape[1] == 11 + 4 * 4 and drawn.observation.shape[1] == size(3) == 26
     absent = drawn.observation[:, 21] == np.float32(np.pi)
     assert 0 < np.sum(absent) < 500
     write_files(tmp_path, export(other, "c"))
     library = CLibrary(tmp_path)
-    np.testing.assert_allclose(library.observe(drawn.situation), drawn.observation, rtol=0, atol=2e-5)
+    observed, _ = library.observe(drawn.situation, drawn.memory)
+    np.testing.assert_allclose(observed, drawn.observation, rtol=0, atol=2e-5)
     np.testing.assert_allclose(library.decide(drawn.observation), drawn.action, rtol=0, atol=1e-6)
     subprocess.run(["make", "-s", "-C", tmp_path, "test"], check=True, capture_output=True)
     session = onnxruntime.InferenceSession(export(other, "onnx")["koz_policy.onnx"])
@@ -278,10 +288,7 @@ def test_a_provenance_cannot_leave_its_comment(agent):
 def test_the_command_line(capsys, tmp_path):
     tiny.untrained_agent().save(tmp_path / "agent")
     assert tiny.status("export", str(tmp_path / "agent"), "--to", "c", "--out", str(tmp_path / "new" / "c")) == 0
-    assert capsys.readouterr().out.split() == [
-        str(tmp_path / "new" / "c" / name)
-        for name in ("koz_math.h", "koz_policy.h", "koz_policy.c", "koz_selftest.c", "Makefile")
-    ]
+    assert capsys.readouterr().out.split() == [str(tmp_path / "new" / "c" / name) for name in C_FILES]
     assert tiny.status("export", "nowhere", "--to", "c", "--out", str(tmp_path)) == 2
     assert "error: agent: 'nowhere' is neither" in capsys.readouterr().err
     (tmp_path / "file").write_text("")

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 from support import tiny
-from support.drawn import metrics_log
+from support.drawn import crowded_labels, metrics_log
 
+from koz_jax.config.presets import preset
 from koz_jax.figures import learning
 
 
@@ -24,6 +25,66 @@ def test_curves_keep_the_values_of_every_run(tmp_path):
     assert band.get_paths()[0].get_extents().y1 == 36.0
     ticks = [tick.get_text() for tick in figure.axes[-1].get_xticklabels()]
     assert ticks == ["0", "20", "40", "+2"]
+
+
+PAPERS_TASK = preset("fast")
+OWN_TASK = tiny.changed({"task": {"spacecraft": {"torque_limit": 0.004}}})
+
+
+@pytest.mark.parametrize(
+    ("configs", "expected"),
+    [
+        ([PAPERS_TASK], True),
+        ([PAPERS_TASK, PAPERS_TASK], True),
+        ([OWN_TASK], False),
+        ([PAPERS_TASK, OWN_TASK], False),
+        ([None], False),
+    ],
+)
+def test_the_papers_lines_are_drawn_for_the_papers_task_only(configs, expected, tmp_path):
+    runs = [metrics_log(tmp_path / str(number)) for number in range(len(configs))]
+    for run, config in zip(runs, configs, strict=True):
+        if config is not None:
+            (run / "config.json").write_text(config.to_json())
+    shown = learning.read_curves(runs)
+    assert shown.is_paper_task == expected
+    figure = learning.draw(shown)
+    papers = {
+        axes.get_ylabel().split(" [")[0]: np.array(line.get_ydata(), float)[0]
+        for axes in figure.axes
+        for line in axes.lines
+        if str(line.get_label()).startswith("paper")
+    }
+    assert papers == (
+        {
+            "mean reward": 7281.91,
+            "success": 97.0,
+            "zone violated": pytest.approx(2.66),
+            "settling time": 27.81,
+            "control effort": 76.02,
+            "control accuracy": 0.08,
+        }
+        if expected
+        else {}
+    )
+
+
+@pytest.mark.parametrize("factor", [1e-9, 1e-6, 0.01, 1.0, 1e4])
+def test_numbers_are_apart_and_in_one_form(factor, tmp_path):
+    shown = learning.read_curves([metrics_log(tmp_path / "run", factor)])
+    figure = learning.draw(shown)
+    assert crowded_labels(figure) == []
+    for axes in figure.axes:
+        low, high = axes.get_ylim()
+        texts = [tick.label1.get_text() for tick in axes.yaxis.get_major_ticks() if low <= tick.get_loc() <= high]
+        assert len({"^" in text for text in texts if text}) == 1, "either all plain, or all powers of ten"
+        assert not any(tick.label1.get_text() for tick in axes.yaxis.get_minor_ticks())
+
+
+def test_the_time_axis_is_named_once(tmp_path):
+    figure = learning.draw(learning.read_curves([metrics_log(tmp_path / "run")]))
+    names = [axes.get_xlabel() for axes in figure.axes] + [legend.get_title().get_text() for legend in figure.legends]
+    assert [name for name in names if name] == ["gradient updates, + refinement iterations"]
 
 
 def test_runs_with_other_instants_are_interpolated_but_not_extended(tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import Collection
 from matplotlib.colors import to_hex
-from support.drawn import outcomes
+from support.drawn import crowded_labels, outcomes
 
 from koz_jax.config.task import TaskConfig
 from koz_jax.figures import monte_carlo
@@ -35,13 +35,59 @@ def test_cases_are_coloured_by_verdict():
     assert f"{(violated & ~settled).sum()} of them not settled" in text
 
 
-def test_what_did_not_settle_is_drawn_at_200_s():
+def labels_of(axis):
+    return [label.get_text() for label in axis.get_ticklabels()]
+
+
+def test_what_did_not_settle_has_a_strip_of_its_own():
     results = outcomes(500)
     shown = monte_carlo.points(results, TaskConfig())
     settled = np.asarray(results.settled)
-    np.testing.assert_array_equal(shown.settling_time[~settled], 200.0)
-    np.testing.assert_array_equal(shown.settling_time[settled], np.asarray(results.settling_time)[settled])
-    assert "did not settle: drawn at 200 s" in monte_carlo.draw_samples(shown).axes[1].texts[0].get_text()
+    times = np.asarray(results.settling_time)[settled]
+    np.testing.assert_array_equal(shown.settling_time[settled], times)
+    (place,) = {*shown.settling_time[~settled]}
+    assert times.max() < place < times.max() + 0.25 * np.ptp(times)
+    samples, relations = monte_carlo.draw_samples(shown), monte_carlo.draw_relations(shown)
+    for axis in (samples.axes[1].yaxis, relations.axes[0].xaxis, relations.axes[1].xaxis):
+        low, high = axis.get_view_interval()
+        assert low < times.min() and place < high < times.max() + 0.35 * np.ptp(times)
+        ticks = dict(zip(labels_of(axis), axis.get_ticklocs(), strict=True))
+        assert ticks.pop("never") == place
+        assert len(ticks) > 2 and max(ticks.values()) <= times.max() + 0.1 * np.ptp(times)
+
+
+def test_where_all_settle_there_is_no_strip():
+    results = outcomes(500, all_settle=True)
+    figure = monte_carlo.draw_samples(monte_carlo.points(results, TaskConfig()))
+    times = np.asarray(results.settling_time)
+    assert figure.axes[1].get_ylim()[1] < times.max() + 0.1 * np.ptp(times)
+    assert "never" not in labels_of(figure.axes[1].yaxis)
+
+
+@pytest.mark.parametrize("all_settle", [False, True])
+@pytest.mark.parametrize("effort", [1e-9, 3.4e-6, 1.0, 1e4])
+def test_no_numbers_of_an_axis_touch(effort, all_settle):
+    shown = monte_carlo.points(outcomes(300, all_settle=all_settle, effort=effort), TaskConfig())
+    for figure in (monte_carlo.draw_samples(shown), monte_carlo.draw_relations(shown)):
+        assert crowded_labels(figure) == []
+    assert crowded_labels(monte_carlo.draw_accuracy(shown, 0.25)) == []
+
+
+def test_the_legend_is_within_the_picture():
+    shown = monte_carlo.points(outcomes(10_000), TaskConfig())
+    assert shown.violated_unsettled
+    for figure in (monte_carlo.draw_samples(shown), monte_carlo.draw_relations(shown)):
+        figure.draw_without_rendering()
+        box = figure.legends[0].get_window_extent()
+        assert box.x0 >= 0.0 and box.x1 <= figure.bbox.x1
+
+
+def test_efforts_of_a_cubesat_have_a_unit_that_suits_them():
+    results = outcomes(300, effort=3.4e-6)
+    figure = monte_carlo.draw_samples(monte_carlo.points(results, TaskConfig()))
+    assert figure.axes[2].get_ylabel() == "control effort [(mN m)² s]"
+    largest = max(offsets(cloud)[:, 1].max() for cloud in figure.axes[2].collections)
+    assert largest == pytest.approx(1e6 * np.max(results.control_effort))
 
 
 def test_the_accuracy_of_settled_cases_stands_alone():

@@ -35,6 +35,7 @@ def mean_cost(policy, keys):
     return jnp.mean(jax.vmap(lambda key: refinement.maneuver_cost(controller, ENV, key, CONFIG))(keys))
 
 
+@pytest.mark.slow
 def test_the_gradient_is_that_of_the_whole_maneuver(policy):
     keys = jax.random.split(jax.random.key(1), 4)
     key_direction = jax.random.key(2)
@@ -69,6 +70,7 @@ def test_the_gradient_is_finite_at_rest_on_the_target():
     assert np.all(np.isfinite(jax.jit(jax.grad(cost))(jnp.zeros(3))))
 
 
+@pytest.mark.slow
 def test_refinement_lowers_the_cost_on_maneuvers_it_has_not_seen(policy):
     keys = jax.random.split(jax.random.key(99), 64)
     state = refinement.init(CONFIG, jax.tree.map(jnp.copy, policy))

@@ -11,6 +11,8 @@ from koz_jax.learning import train_step
 from koz_jax.learning.train_step import TrainState
 from koz_jax.task import observation_layout
 
+pytestmark = pytest.mark.slow
+
 # Large angles, three zones, and time enough for random torques to drift into one.
 SETTINGS = {
     "task": {"scenario": {"max_zones": 3, "max_rate_deg": 6.0}},

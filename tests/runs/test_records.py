@@ -12,16 +12,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support import tiny
+from support.runs import state_of
 from support.tiny import CONFIG
 from tensorboardX.event_file_writer import EventsWriter
 
 import koz_jax
 from koz_jax.agents.agent import load_agent
 from koz_jax.config.training import TrainConfig
-from koz_jax.errors import StorageError
-from koz_jax.runs import provenance, stages
+from koz_jax.errors import SettingsError, StorageError
+from koz_jax.learning import refinement
+from koz_jax.runs import checkpoint, provenance, stages
+from koz_jax.runs.folder import RunFolder
 from koz_jax.runs.metrics_log import MetricsLog, read_metrics
 from koz_jax.runs.progress import Progress
+from koz_jax.runs.trainer import train
+from koz_jax.storage.lock import FolderLock
 
 
 def test_layout_of_a_run(run):
@@ -111,8 +117,6 @@ def test_the_log_goes_on_from_the_text_of_the_checkpoint(tmp_path):
         path.write_text(damage)
         log = MetricsLog(tmp_path, text, 20)
         assert path.read_text() == log.text == text
-        with pytest.raises(KeyError, match="colour"):
-            log.write(30, {"colour": 1.0}, {})
         log.write(30, {"eval/score": 0.5, "loss": 10.0}, {"rate": 8.0})
         log.write(40, {"eval/score": 0.5}, {"rate": 9.0})
         log.close()
@@ -185,3 +189,79 @@ def test_the_commit_is_that_of_the_package_never_of_a_repository_around_it(tmp_p
 def test_the_command_is_what_the_caller_says_it_is():
     assert provenance.collect(CONFIG, "koz train --preset smoke").command == "koz train --preset smoke"
     assert provenance.collect(CONFIG, "").command == ""
+
+
+def test_a_log_refuses_a_column_that_its_first_row_has_not(tmp_path):
+    log = MetricsLog(tmp_path, "", 0)
+    log.write(10, {"loss": 1.0}, {})
+    with pytest.raises(KeyError, match="colour"):
+        log.write(20, {"colour": 1.0}, {})
+    log.close()
+
+
+def test_the_log_of_an_older_version_goes_on_with_its_columns(run, tmp_path):
+    """What was not logged yet when the run began, such as eval/unsafe_start_rate, is left out of it."""
+    rows = read_metrics(run.path / "metrics.csv")
+    older = [name for name in rows[0] if name != "eval/unsafe_start_rate"]
+    assert len(older) == len(rows[0]) - 1
+    text = "\n".join([",".join(older), *(",".join(row[name] for name in older) for row in rows[:4])]) + "\n"
+    log = MetricsLog(tmp_path, text, 64)
+    log.write(80, {"eval/score": 3.0, "eval/unsafe_start_rate": 0.5}, {})
+    log.close()
+    last = read_metrics(tmp_path / "metrics.csv")[-1]
+    assert (last["updates"], last["eval/score"], "eval/unsafe_start_rate" in last) == ("80", "3", False)
+    assert (tmp_path / "metrics.csv").read_text().startswith(text)
+
+
+def test_an_agent_tells_how_much_refinement_was_tried(run):
+    assert load_agent(run.agent("phase2")).provenance.refinements_tried == 8
+    assert load_agent(run.agent("phase2-sac")).provenance.refinements_tried == 0
+
+
+@pytest.mark.parametrize("better", [False, True])
+def test_a_refinement_that_gave_no_better_agent_says_so(run, tmp_path, monkeypatch, capsys, better):
+    """Resumed at the beginning of the refinement, with evaluations that make every refined agent worse, or better."""
+    shutil.copytree(run.path, tmp_path / "run")
+    folder, done = RunFolder(tmp_path / "run"), 128
+    state = state_of(run.checkpoints()[0])
+    begun = state.replace(
+        best_score=np.float32(100.0),
+        best_at=np.int32(96),
+        refine=refinement.init(CONFIG, state.best.averaged_policy),
+    )
+    for path in folder.checkpoints():
+        shutil.rmtree(path)
+    checkpoint.save(folder.checkpoint(done), begun, CONFIG)
+    monkeypatch.setattr(stages.Stage, "score", lambda *_: 200.0 if better else -200.0)
+    trained = train(CONFIG, folder.path, resume=True)
+    assert trained is not None
+    told = "refine: gave no better agent; kept the one of update 96" in capsys.readouterr().err
+    assert told == (not better)
+    for agent in (trained, load_agent(folder.path)):
+        found = agent.provenance
+        assert (found.updates, found.refinements) == ((128, 4) if better else (96, 0))
+        assert found.refinements_tried == 8
+
+
+def test_a_finished_run_can_be_made_small(copied):
+    before = copied.size
+    assert before == sum(len(content) for content in tiny.contents(copied.path).values() if content)
+    freed = copied.trim()
+    assert copied.size == before - freed
+    assert not copied.checkpoints() and not copied.snapshot("phase1").exists()
+    assert load_agent(copied.path).provenance.refinements_tried == 8
+    assert copied.read_config() == CONFIG and (copied.path / "metrics.csv").exists()
+    assert copied.trim() == 0
+
+
+def test_a_run_that_is_not_finished_keeps_its_checkpoints(copied):
+    shutil.rmtree(copied.checkpoints()[0])
+    with pytest.raises(SettingsError, match=r"is not finished \(132 of 136 updates and iterations\)"):
+        copied.trim()
+    assert copied.checkpoints()
+
+
+def test_a_run_under_way_is_not_trimmed(copied):
+    with FolderLock(copied.path), pytest.raises(SettingsError, match="in use by another process"):
+        copied.trim()
+    assert copied.checkpoints()

@@ -47,6 +47,7 @@ SETTINGS: dict[str, Any] = {
     "refine_log_every": 2,
     "refine_eval_every": 4,
     "eval_cases": 12,
+    "eval_min_angle_deg": 0.0,  # or there would be nothing to learn in so short an episode
 }
 LEARNED = 128  # updates
 CASES = 12  # as many as in an evaluation: what is compiled for one serves the other
@@ -194,4 +195,5 @@ def unshielded(cases: int) -> dict[str, Any]:
         "intervention_rate": np.zeros(cases, np.float32),
         "mean_torque_change": np.zeros(cases, np.float32),
         "deadlocked": np.zeros(cases, bool),
+        "unsafe_start": np.zeros(cases, bool),
     }

@@ -10,6 +10,7 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 from support import tiny
+from support.drawn import CUBESAT
 from support.tiny import CONFIG, untrained_agent
 
 from koz_jax.agents.agent import Agent
@@ -37,6 +38,13 @@ def agents():
 @pytest.fixture(scope="module")
 def flown(agents: list[Agent]):
     return [fly(agent, PAPER) for agent in agents]
+
+
+@pytest.fixture(scope="module")
+def mixed(agents, flown):
+    """A maneuver of the paper's spacecraft beside one of a CubeSat."""
+    long = TaskConfig.model_validate(CUBESAT.model_dump() | {"episode_seconds": 12.0, "step_seconds": 0.1})
+    return [flown[0], fly(agents[1], PAPER, "/some/where/runs/6u", task=long)]
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +77,51 @@ def test_file_stands_alone_and_is_small(text):
     assert len(own.encode()) < LONGEST - 5e6 + 2e5
     assert not re.search(r"<script[^>]+src", own) and not re.search(r"<link[^>]+href=\"(?!data:)", own)
     assert own.count("<script") == 3 == own.count("</script>")
+
+
+def test_different_spacecraft_are_not_compared(mixed, flown):
+    together, apart = page.render(flown, "same"), page.render(mixed, "mixed")
+    assert '<p class="caution"></p>' in together
+    (caution,) = re.findall(r'<p class="caution">(.*?)</p>', apart)
+    assert caution == (
+        "These spacecraft differ, so the maneuvers compare nothing: each has scales of its own; the scenario&#x27;s"
+        " telescope is not that of 6u."
+    )
+
+    def scales(rendered):
+        layouts = [maneuver["timeline"]["layout"] for maneuver in content_of(rendered)["maneuvers"]]
+        return [[layout[axis]["range"] for axis in ("yaxis", "yaxis2", "yaxis3")] for layout in layouts]
+
+    one, other = scales(together)
+    assert one == other
+    (_, _, large), (_, _, small) = scales(apart)
+    assert large == pytest.approx([-2.24, 2.24]) and small == pytest.approx([-4.48, 4.48])
+
+
+def test_small_torques_keep_their_digits(mixed):
+    large, small = content_of(page.render(mixed, "mixed"))["maneuvers"]
+    assert [large["torqueUnit"], small["torqueUnit"]] == ["N m", "mN m"]
+    for maneuver, shown in zip(mixed, (large, small), strict=True):
+        factor = {"N m": 1.0, "mN m": 1e3}[shown["torqueUnit"]]
+        torque = np.transpose([curve["y"] for curve in shown["timeline"]["data"][2:]])
+        np.testing.assert_allclose(torque, factor * np.asarray(maneuver.history.torque_B), atol=1e-4)
+        titles = [note["text"] for note in shown["timeline"]["layout"]["annotations"]]
+        assert titles[-1] == f"torque [{shown['torqueUnit']}]"
+    effort = 1e6 * float(mixed[1].result.control_effort)
+    (text,) = (verdict["text"] for verdict in small["verdicts"] if verdict["text"].startswith("effort"))
+    assert text.endswith(" (mN m)² s") and float(text.split()[1]) == pytest.approx(effort, rel=6e-3)
+
+
+def test_titles_stand_above_the_numbers_of_their_axis(content):
+    layout = content["maneuvers"][0]["timeline"]["layout"]
+    tops = [layout[axis]["domain"][1] for axis in ("yaxis", "yaxis2", "yaxis3")]
+    for title, top in zip(layout["annotations"], tops, strict=True):
+        assert (title["x"], title["xanchor"], title["y"], title["yanchor"]) == (0.0, "left", top, "bottom")
+    assert not any("title" in layout[axis] for axis in ("yaxis", "yaxis2", "yaxis3"))
+
+
+def test_a_path_is_shown_by_its_last_part(mixed):
+    assert content_of(page.render(mixed, "x"))["maneuvers"][1]["label"] == "6u"
 
 
 def test_titles_cannot_become_markup(text, content):
@@ -138,12 +191,21 @@ def test_any_number_of_zones(agents, half_angles_deg):
     half_angles = jnp.deg2rad(jnp.array(half_angles_deg or (-180.0,)))
     boresights = jnp.tile(PAPER.constraints.boresight_B, (len(axes), 1))
     drawn = PAPER.replace(constraints=PointingConstraint(boresights, axes, half_angles))
-    (maneuver,) = content_of(page.render([fly(agents[0], drawn, "one")], "zones"))["maneuvers"]
+    text = page.render([fly(agents[0], drawn, "one")], "zones")
+    (maneuver,) = content_of(text)["maneuvers"]
     edges = [trace for trace in maneuver["scene"]["data"] if trace["name"] == "zone edge"]
     assert len(edges) == len(half_angles_deg)
     for trace, axis, angle in zip(edges, "xyz", half_angles_deg, strict=False):
         np.testing.assert_allclose(np.rad2deg(np.arccos(trace[axis])), angle, atol=0.02)
     assert ("zone" in str(maneuver["verdicts"])) == bool(half_angles_deg)
+    numbers = [trace for trace in maneuver["scene"]["data"] if trace["name"] == "zone numbers"]
+    assert len(numbers) == (len(half_angles_deg) > 1)
+    for trace in numbers:
+        assert trace["text"] == ["<b>1</b>", "<b>2</b>"]
+        places = np.array([trace[axis] for axis in "xyz"]).T
+        np.testing.assert_allclose(np.argmax(places, axis=1), [0, 1])
+        np.testing.assert_allclose(places.max(axis=1), np.cos(np.deg2rad(half_angles_deg)), atol=1e-4)
+        assert "zone 1 of 20.0° half angle, zone 2 of 35.0° half angle" in text
 
 
 def maneuver_of(seconds, step, settling_time):

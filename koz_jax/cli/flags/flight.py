@@ -5,12 +5,13 @@ Names, units, defaults and help come from the settings that the flags fill in.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
 from koz_jax.agents.record import shipped_agents
-from koz_jax.cli.flags.parsing import agents_own, same_as
+from koz_jax.cli.flags import parsing
+from koz_jax.cli.flags.parsing import ChangesOf, agents_own, same_as
 from koz_jax.config.base import MarginDeg, NonNegativeFloat, Settings, ZoneCount
 from koz_jax.config.monte_carlo import CaseConfig, MonteCarloConfig
 from koz_jax.config.shield import CERTAIN, ShieldConfig, UncertaintyConfig
@@ -56,6 +57,11 @@ class AgentFlags(Settings):
 class _RuleFlags(Settings):
     """How the task is drawn and judged, and whether it is shielded."""
 
+    task_changes: Annotated[dict[str, Any], ChangesOf(TaskConfig)] = Field(
+        default={},
+        alias="task",
+        description="Fly another task: what is given here takes the place of what the agent was made for.",
+    )
     infeasible_zone: Literal["resample", "shrink"] | None = agents_own(ScenarioConfig, "infeasible_zone")
     zones: ZoneCount | None = None
     """Number of zones of every case; by default the agent's."""
@@ -108,10 +114,11 @@ class FlightFlags(UncertaintyConfig, _RuleFlags, CaseConfig):
         """What is flown: the task that a controller was made for, with the changes that the flags ask for.
 
         Raises:
-            SettingsError: the shield has no torque for what it is to withstand.
+            SettingsError: a change is not allowed, or the shield has no torque for what it is to withstand.
 
         """
-        task = agent.task.with_rules(self.angle_convention, self.infeasible_zone, self.zones, self.max_rate_deg)
+        changed = parsing.applied("task", agent.task, self.task_changes)
+        task = changed.with_rules(self.angle_convention, self.infeasible_zone, self.zones, self.max_rate_deg)
         if self.shield_config is not None:
             self.shield_config.check(task.spacecraft.torque_limits)
         return task

@@ -10,6 +10,7 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 from pydantic import Field, ValidationError
+from pydantic.fields import FieldInfo
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from koz_jax.config.base import Settings
@@ -19,6 +20,17 @@ Flags = TypeVar("Flags", bound=Settings)
 SettingsType = TypeVar("SettingsType", bound=Settings)
 
 _REGISTRY = ConstructorRegistry()
+
+
+@dataclasses.dataclass(frozen=True)
+class ChangesOf:
+    """Marks a field of type ``dict`` that holds what the command line changes of other settings.
+
+    Only what was typed is in it, section by section and unchecked: what it changes is known later (see ``applied``).
+    Its flags begin with the field's alias.
+    """
+
+    settings: type[Settings]  # with a default for every field
 
 
 def parse(flags: type[Flags], argv: Sequence[str], prog: str) -> Flags:
@@ -35,7 +47,7 @@ def parse(flags: type[Flags], argv: Sequence[str], prog: str) -> Flags:
 
     """
     found = tyro.cli(_plain(flags, {}), args=argv, prog=prog, registry=_REGISTRY)
-    return _validated((flags, found))[0]
+    return _validated(argv, (flags, found))[0]
 
 
 def parse_with(
@@ -51,7 +63,7 @@ def parse_with(
     everything = dataclasses.make_dataclass("Arguments", fields, frozen=True)
     everything.__doc__ = flags.__doc__
     found = tyro.cli(everything, args=argv, prog=prog, registry=_REGISTRY)
-    read, changed = _validated((flags, found.flags), (type(settings), found.settings))
+    read, changed = _validated(argv, (flags, found.flags), (type(settings), found.settings))
     return read, changed
 
 
@@ -72,12 +84,53 @@ def agents_own(settings: type[Settings], name: str) -> Any:
     return Field(default=None, description=f"{description.rstrip('.')}; by default the agent's.")
 
 
-def _validated(*parts: tuple[type[Settings], Any]) -> tuple[Any, ...]:
+def applied(flag: str, settings: SettingsType, changed: dict[str, Any]) -> SettingsType:
+    """Settings with the changes of a field that is marked with ``ChangesOf``.  flag: its alias.
+
+    Raises:
+        SettingsError: a value is not allowed.
+
+    """
+    try:
+        return type(settings).model_validate(_merged(settings.model_dump(), changed))
+    except ValidationError as error:
+        lines = explain(error).splitlines()
+        raise SettingsError("\n".join(f"{flag}.{line}" for line in lines)) from None
+
+
+def _merged(values: dict[str, Any], changed: dict[str, Any]) -> dict[str, Any]:
+    inner = {name: _merged(values[name], value) for name, value in changed.items() if isinstance(value, dict)}
+    return values | changed | inner
+
+
+def _changed_by(field: FieldInfo) -> type[Settings] | None:
+    """Settings of which a field holds changes; None if it holds none."""
+    return next((mark.settings for mark in field.metadata if isinstance(mark, ChangesOf)), None)
+
+
+def _typed(argv: Sequence[str], values: dict[str, Any], flag: str) -> dict[str, Any]:
+    """Those of some values whose flags were typed."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        its_flag = f"{flag}.{name}"
+        if isinstance(value, dict):
+            inner = _typed(argv, value, its_flag)
+            found |= {name: inner} if inner else {}
+        elif any(word.partition("=")[0].replace("-", "_") == its_flag.replace("-", "_") for word in argv):
+            found[name] = value
+    return found
+
+
+def _validated(argv: Sequence[str], *parts: tuple[type[Settings], Any]) -> tuple[Any, ...]:
     """Check what was filled in.  parts: settings, and what was found for them."""
     settings, wrong = [], []
     for kind, found in parts:
+        values = _values(found)
+        for field in kind.model_fields.values():
+            if field.alias and _changed_by(field):
+                values[field.alias] = _typed(argv, values[field.alias], f"--{field.alias}")
         try:
-            settings.append(kind.model_validate(_values(found)))
+            settings.append(kind.model_validate(values))
         except ValidationError as error:
             wrong.append(explain(error))
     if wrong:
@@ -102,8 +155,13 @@ def _plain(settings: Settings | type[Settings], helps: Mapping[str, str]) -> typ
             fields.append((field.alias or name, annotation))
             continue
         value = field.get_default() if isinstance(settings, type) else getattr(settings, name)
+        changed = _changed_by(field)
+        if changed is not None:
+            value = changed()
         if isinstance(value, Settings):
             section = _plain(value, {})
+            if changed is not None:
+                section.__doc__ = field.description
             annotation, value = section, section()
         fields.append((field.alias or name, annotation, value))
     plain = dataclasses.make_dataclass(kind.__name__, fields, frozen=True)

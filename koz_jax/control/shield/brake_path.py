@@ -122,34 +122,35 @@ def clearance(
     length = _free_seconds(brake, motion.momentum, model.dt)
     piece = length / brake.samples
     tolerance = _tolerance(brake, motion, length, push_error, model.dt)
-    margins = pointing_constraints.margins(body.q_BN, at.constraints)
-    straight = margins - motion.speed * length - tolerance.after(jnp.float32(1.0), length)
+    reach = motion.speed * length + tolerance.after(jnp.float32(1.0), length)
+    straight = pointing_constraints.margins(body.q_BN, at.constraints) - reach
     at_once = jnp.min(jnp.where(at.constraints.is_present, straight, jnp.inf))
 
-    axes_B = jax.vmap(pointing_constraints.axis_B, in_axes=(None, 0))(body.q_BN, at.constraints)
-    start = _Coast(*jnp.concatenate([momentum_B[None], axes_B]).T)
+    is_enough = at_once >= enough
+    begin = _Walk(_start(body, momentum_B, at), jnp.where(is_enough, brake.samples, 0), at_once)
     # Between samples the cosine of theta rises above the chord by at most its second derivative times piece^2 / 8.
     bulge = motion.bend * piece**2 / 8.0
     inverse_B = dynamics.inverse(model.inertia_B)
 
-    def margin(coast: _Coast, done: jax.Array | int) -> jax.Array:
-        cosines = _cosines(coast, at.constraints.boresight_B) + bulge
-        return _margin(cosines, at.constraints) - tolerance.after(done / brake.samples, done * piece)
+    def lower(walk: _Walk) -> _Walk:
+        cosines = _cosines(walk.at, at.constraints.boresight_B) + bulge
+        margin = _margin(cosines, at.constraints) - tolerance.after(walk.done / brake.samples, walk.done * piece)
+        return walk.replace(lowest=jnp.minimum(walk.lowest, margin))
 
     def advance(walk: _Walk) -> _Walk:
-        coast, done = _coast(walk.at, inverse_B, piece), walk.done + 1
-        return _Walk(coast, done, jnp.minimum(walk.lowest, margin(coast, done)))
+        return lower(walk.replace(at=_coast(walk.at, inverse_B, piece), done=walk.done + 1))
 
     def go_on(walk: _Walk) -> jax.Array:
         return (walk.done < brake.samples) & (walk.lowest >= least)
 
-    is_enough = at_once >= enough
-    begin = _Walk(
-        at=start,
-        done=jnp.where(is_enough, brake.samples, 0),
-        lowest=jnp.where(is_enough, at_once, margin(start, 0)),
-    )
-    return jax.lax.while_loop(go_on, advance, begin).lowest
+    seen = lower(begin.replace(lowest=jnp.inf)).lowest
+    first = begin.replace(lowest=jnp.where(is_enough, at_once, seen))
+    return jax.lax.while_loop(go_on, advance, first).lowest
+
+
+def _start(body: RigidBodyState, momentum_B: jax.Array, at: Situation) -> _Coast:
+    axes_B = jax.vmap(pointing_constraints.axis_B, in_axes=(None, 0))(body.q_BN, at.constraints)
+    return _Coast(*jnp.concatenate([momentum_B[None], axes_B]).T)
 
 
 def step_clearance(

@@ -90,12 +90,7 @@ class Shield(struct.PyTreeNode):
             # than there should be; of a fast one it is a bound that may have been better before.  Inside a zone any way
             # out is good.
             present = jnp.where(slow | inside_now, search.braking, jnp.inf)
-            least = jnp.where(
-                number < _ASKED + len(asked_B),
-                jnp.minimum(self.margin, present + RAISE),
-                jnp.minimum(0.5 * self.margin, present),
-            )
-            least = jnp.where(number == _REQUEST, self.margin, least)
+            least = self._least(number, present)
             pushed = brake_path.push_error(self.brake, candidate_B, model.dt)
             needed = jnp.where(number == _BRAKE, -jnp.inf, least)
             found = brake_path.clearance(self.brake, after, pushed, situation, model, self.margin, needed)
@@ -109,6 +104,12 @@ class Shield(struct.PyTreeNode):
         begin = _Search(jnp.int32(_REQUEST), jnp.array(False), jnp.float32(jnp.inf))
         end = jax.lax.while_loop(lambda search: ~search.made & (search.number < last), attempt, begin)
         return tried_B[end.number]
+
+    def _least(self, number: jax.Array, present: jax.Array) -> jax.Array:
+        """Clearance that a candidate must have.  present: () [rad] that braking leaves; inf where it does not count."""
+        is_asked = (number >= _ASKED) & (number < _ASKED + len(REQUEST_SHARES))
+        mixed = jnp.where(is_asked, jnp.minimum(self.margin, present + RAISE), jnp.minimum(0.5 * self.margin, present))
+        return jnp.where(number == _REQUEST, self.margin, mixed)
 
 
 class _Search(struct.PyTreeNode):

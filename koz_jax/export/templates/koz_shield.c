@@ -1,6 +1,7 @@
 /*
  * See koz_shield.h.  A candidate passes if braking after it keeps the margin; the first one that passes is the torque:
- * the request, mixes of it with a guide around the zone, the guide away from it, mixes of the guide with the brake.
+ * the request, a guide away from the zone where there is too little, mixes of the request with a guide around the zone,
+ * mixes of that guide with the brake.
  *
 @HEAD@
  */
@@ -359,7 +360,7 @@ int koz_is_safe(const koz_situation *now)
 typedef struct {
     const koz_situation *now;
     body_state body;
-    float present; /* [rad] clearance of braking from a slow state, where it is known well; else unbounded */
+    float present; /* [rad] clearance of braking, where what is no worse will do; else unbounded */
 } search;
 
 /* Lower bound of the clearance [rad] after a candidate; one below least is returned as it stands. */
@@ -400,11 +401,10 @@ static void allow(const koz_situation *now, const float requested_B[3], float al
     push(&at.body, brake_B, &after);
     braking = clearance_after(&at, brake_B, &after, -unbounded);
     (void)twice_energy(&at.body, &momentum);
-    /* Inside a zone any way out is good. */
+    /* Of a slow state the clearance is known well, and what is no worse will do; inside a zone any way out is good. */
     if (momentum <= slow_steps * brake_limit * KOZ_STEP_SECONDS || nearest <= 0.0f) at.present = braking;
-    least = smaller(0.5f * shield_margin, at.present);
-    if (braking < 0.5f * shield_margin && passes(&at, 1.0f, away_B, away_B, least, allowed_B)) return;
     least = smaller(shield_margin, at.present + least_gain);
+    if (braking < 0.5f * shield_margin && passes(&at, 1.0f, away_B, away_B, least, allowed_B)) return;
     for (i = 0; i < REQUEST_SHARES; i++)
         if (passes(&at, request_shares[i], request_B, around_B, least, allowed_B)) return;
     least = smaller(0.5f * shield_margin, at.present);

@@ -1,0 +1,87 @@
+"""Flags that describe a maneuver without a file.  Imports no jax."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Self
+
+import tyro
+from pydantic import ValidationError, model_validator
+
+from koz_jax.config.base import Settings
+from koz_jax.config.maneuver import ManeuverConfig
+from koz_jax.config.maneuver_file import load_spacecraft
+from koz_jax.config.task import TaskConfig
+from koz_jax.errors import explain
+
+FourNumbers = tuple[float, float, float, float]
+
+# Where a flag ends up in the maneuver, for messages.
+_FLAGS = {"start.attitude": "from", "target.attitude": "to", "constraints.": "keep_out."}
+
+# What the spacecraft's own instrument is called where nobody has named it.
+_INSTRUMENT = "boresight"
+
+
+class TurnFlags(Settings):
+    """A maneuver without a file."""
+
+    start: Annotated[FourNumbers | None, tyro.conf.arg(name="from", metavar="W X Y Z")] = None
+    """Fly from this attitude (scalar first, body relative to inertial), at rest."""
+    target: Annotated[FourNumbers | None, tyro.conf.arg(name="to", metavar="W X Y Z")] = None
+    """Fly to this attitude."""
+    keep_out: Annotated[
+        tuple[FourNumbers, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="X Y Z HALF_ANGLE")
+    ] = ()
+    """With --from and --to: a cone to stay out of, its axis in inertial axes and its half angle [deg]."""
+    spacecraft: Path | None = None
+    """With --from and --to: a TOML file with a table [spacecraft] and step_seconds, such as a maneuver file, whose
+    first instrument is taken; by default the agent's spacecraft."""
+
+    @model_validator(mode="after")
+    def _from_and_to(self) -> Self:
+        if (self.start is None) != (self.target is None):
+            here, missing = ("from", "to") if self.target is None else ("to", "from")
+            raise ValueError(f"{here}: needs --{missing} too")
+        if self.start is None and (self.keep_out or self.spacecraft is not None):
+            raise ValueError(f"{'keep_out' if self.keep_out else 'spacecraft'}: needs --from and --to")
+        return self
+
+    def turn(self, own: TaskConfig) -> ManeuverConfig:
+        """The maneuver that the flags describe.
+
+        own: what the agent was made for, flown where no other spacecraft is given.
+
+        Raises:
+            SettingsError: the file cannot be read.
+            ValueError: the flags make no maneuver; a line for each that is wrong.
+
+        """
+        if self.spacecraft is None:
+            given = {
+                "step_seconds": own.step_seconds,
+                "duration_seconds": own.episode_seconds,
+                "settled_angle_deg": own.reward.settled_angle_deg,
+                "spacecraft": {"inertia": own.spacecraft.inertia, "torque_limit": own.spacecraft.torque_limit},
+                "instruments": [{"name": _INSTRUMENT, "boresight": own.spacecraft.boresight}],
+            }
+        else:
+            found = load_spacecraft(self.spacecraft)
+            given = found.model_dump(exclude={"name"})
+            if not found.instruments:
+                given["instruments"] = [{"name": _INSTRUMENT, "boresight": own.spacecraft.boresight}]
+        instrument = given["instruments"][0]["name"]
+        cones = [
+            {"instrument": instrument, "direction": (x, y, z), "half_angle_deg": angle}
+            for x, y, z, angle in self.keep_out
+        ]
+        ends = {"start": {"attitude": self.start}, "target": {"attitude": self.target}}
+        try:
+            return ManeuverConfig.model_validate(
+                {"name": "a turn of one's own"} | given | ends | {"constraints": cones}
+            )
+        except ValidationError as error:
+            message = explain(error)
+            for place, flag in _FLAGS.items():
+                message = message.replace(place, flag)
+            raise ValueError(message) from None
