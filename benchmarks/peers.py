@@ -13,7 +13,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import adapters
+import adapter_rates
 import tyro
 from peer_record import PeerResult, rows
 from peer_report import Report, markdown
@@ -86,7 +86,7 @@ def main(args: Args) -> None:
         raise SystemExit(f"peers: unknown {', '.join(unknown)}; allowed: {', '.join(NAMES)}")
     saved = args.out / "peers.json"
     before = Report.model_validate_json(saved.read_text()) if saved.exists() else Report()
-    report = before.model_copy(update={"environment": adapters.rates()}) if args.peers else before
+    report = before.model_copy(update={"environment": adapter_rates.rates()}) if args.peers else before
     for name in args.peers:
         print(name, flush=True)
         found = {result.name: result for result in report.results} | {name: in_process(name, args)}

@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from koz_jax.config.task import SpacecraftConfig
+
 ActuatorState = Any  # a pytree of fixed shapes; None where actuators have no state
 
 
@@ -71,3 +73,8 @@ class TorqueBox(struct.PyTreeNode):
     def apply(self, command: jax.Array, state: None) -> tuple[jax.Array, None]:
         """Scale the command by the limits.  command: (3,).  Returns the torque (3,) [N m]."""
         return self.limit_B * jnp.clip(command, -1.0, 1.0), state
+
+
+def from_config(spacecraft: SpacecraftConfig) -> Actuators:
+    """The actuators that the settings of a spacecraft ask for, float32."""
+    return TorqueBox(jnp.array(spacecraft.torque_limits, jnp.float32))

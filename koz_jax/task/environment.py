@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from flax import struct
 
 from koz_jax.config.task import TaskConfig, check_deviations, check_feasible
-from koz_jax.task import maneuver, observation, pointing_constraints, reward, rotations, scenario, state
+from koz_jax.task import actuators, maneuver, observation, pointing_constraints, reward, rotations, scenario, state
 from koz_jax.task import uncertainty as errors
-from koz_jax.task.actuators import TorqueBox, TorqueLimits
+from koz_jax.task.actuators import TorqueLimits
 from koz_jax.task.reward import Outcome, RewardParams, RewardTerms
 from koz_jax.task.scenario import SamplingRule, Scenario, ScenarioRanges
 from koz_jax.task.state import EnvState, Model, Truth, attitude_error, select_envs
@@ -195,13 +195,13 @@ class Reorientation(struct.PyTreeNode):
         )
 
     def _advance(self, before: EnvState, command: Command, truth: Truth) -> tuple[EnvState, Outcome]:
-        torque_B, actuators = self.model.actuators.apply(command.applied, before.actuators)
+        torque_B, actuator_state = self.model.actuators.apply(command.applied, before.actuators)
         after = before.replace(
             body=state.propagate(before.body, torque_B, truth, self.model.dt),
             q_e0_previous=attitude_error(before)[0],
             torque_B=torque_B,
             steps=before.steps + 1,
-            actuators=actuators,
+            actuators=actuator_state,
         )
         after = after.replace(angle=rotations.rotation_angle(attitude_error(after)))
         change = jnp.where(before.steps == 0, 0.0, rotations.norm(torque_B - before.torque_B))
@@ -268,6 +268,6 @@ def model_from_config(task: TaskConfig) -> Model:
     """The spacecraft as the settings say, float32."""
     return Model(
         inertia_B=jnp.array(task.spacecraft.inertia),
-        actuators=TorqueBox(jnp.array(task.spacecraft.torque_limits, jnp.float32)),
+        actuators=actuators.from_config(task.spacecraft),
         dt=jnp.float32(task.step_seconds),
     )

@@ -403,8 +403,9 @@ static void allow(const koz_situation *now, const float requested_B[3], float al
     (void)twice_energy(&at.body, &momentum);
     /* Of a slow state the clearance is known well, and what is no worse will do; inside a zone any way out is good. */
     if (momentum <= slow_steps * brake_limit * KOZ_STEP_SECONDS || nearest <= 0.0f) at.present = braking;
-    least = smaller(shield_margin, at.present + least_gain);
+    least = smaller(0.5f * shield_margin, at.present);
     if (braking < 0.5f * shield_margin && passes(&at, 1.0f, away_B, away_B, least, allowed_B)) return;
+    least = smaller(shield_margin, at.present + least_gain);
     for (i = 0; i < REQUEST_SHARES; i++)
         if (passes(&at, request_shares[i], request_B, around_B, least, allowed_B)) return;
     least = smaller(0.5f * shield_margin, at.present);
@@ -419,5 +420,6 @@ void koz_shield(const koz_situation *now, const float requested_B[3], float allo
     float found_B[3] = {0.0f, 0.0f, 0.0f};
     int i;
     if (koz_fault(now) == NULL) allow(&unit, requested_B, found_B);
-    for (i = 0; i < 3; i++) allowed_B[i] = found_B[i];
+    /* No more than there is, not by rounding either. */
+    for (i = 0; i < 3; i++) allowed_B[i] = larger(-@LIMIT_OF_I@, smaller(@LIMIT_OF_I@, found_B[i]));
 }

@@ -1,6 +1,6 @@
 """Environment steps per second through every adapter.
 
-python benchmarks/adapters.py
+python benchmarks/adapter_rates.py
 """
 
 import time
