@@ -62,6 +62,13 @@ class _Found(struct.PyTreeNode):
     best_B: jax.Array  # (sines, 3) [rad]
 
 
+class _Search(struct.PyTreeNode):
+    """For a plan, where one is needed."""
+
+    plan: Plan
+    needed: jax.Array  # () bool
+
+
 class PathPlanner(struct.PyTreeNode):
     """Plans in ``begin``, tracks in ``decide``, and plans anew where something has led it off its path.
 
@@ -145,14 +152,12 @@ class PathPlanner(struct.PyTreeNode):
 
     def _not_lost(self, state: EnvState, model: Model, plan: Plan) -> Plan:
         """The plan, or a new one from here where the body is too far from it."""
+        lost = rotations.norm(plan.error(state.body)) > _LOST * self.patience
 
-        def is_lost(plan: Plan) -> jax.Array:
-            return rotations.norm(plan.error(state.body)) > _LOST * self.patience
-
-        def anew(lost: Plan) -> Plan:
+        def anew(search: _Search) -> _Search:
             # Without the barrier the search is done in advance, at every step, as it does not depend on the loop.
-            lost, here = jax.lax.optimization_barrier((lost, state))
-            return self.begin(here, model, lost.key)
+            search, here = jax.lax.optimization_barrier((search, state))
+            return _Search(self.begin(here, model, search.plan.key), jnp.array(False))
 
         # A loop, not a branch: a batch then plans only when one of it is lost.
-        return jax.lax.while_loop(is_lost, anew, plan)
+        return jax.lax.while_loop(lambda search: search.needed, anew, _Search(plan, lost)).plan
