@@ -57,8 +57,8 @@ def test_planned_paths_stay_clear_of_all_zones(plans):
 @pytest.mark.slow
 def test_plans_begin_at_the_start_and_end_at_rest_at_the_target(plans):
     drawn, found = plans
-    begin = jax.vmap(lambda plan: plan.reference(jnp.float32(0.0)))(found)
-    end = jax.vmap(lambda plan: plan.reference(plan.timing.duration + 1.0))(found)
+    begin = jax.vmap(lambda plan: plan.reference(jnp.float32(0.0), jnp.float32(1.0)))(found)
+    end = jax.vmap(lambda plan: plan.reference(plan.timing.duration + 1.0, jnp.float32(1.0)))(found)
     np.testing.assert_allclose(begin.q_BN, drawn.initial.q_BN, atol=1e-6)
     # The sign too: the maneuver ends at +1.
     np.testing.assert_allclose(end.q_BN, drawn.q_DN, atol=1e-5)
@@ -83,7 +83,7 @@ def test_plans_for_unequal_limits_use_each_of_them():
     assert np.mean(shares.max(axis=2) > 1.1) < 0.01
     assert np.mean(shares.max(axis=2) > 0.9) > 0.8
     assert np.all(np.mean(shares > 0.9, axis=(0, 1)) > 0.05)
-    end = jax.vmap(lambda plan: plan.reference(plan.timing.duration + 1.0))(found)
+    end = jax.vmap(lambda plan: plan.reference(plan.timing.duration + 1.0, jnp.float32(1.0)))(found)
     np.testing.assert_allclose(end.q_BN, drawn.q_DN, atol=1e-5)
 
 
@@ -93,7 +93,7 @@ def needed_torques(found):
 
     def torque(plan, share):
         time = share * plan.timing.duration
-        before, now, after = (plan.reference(time + shift).omega_BN_B for shift in (-h, 0.0, h))
+        before, now, after = (plan.reference(time + shift, jnp.float32(1.0)).omega_BN_B for shift in (-h, 0.0, h))
         return (after - before) / (2 * h), now
 
     shares = jnp.linspace(0.02, 0.98, 97)

@@ -217,7 +217,10 @@ def _adversary(name: str) -> AnyAdversary:
 
 
 def _violations(name: str, config: MonteCarloConfig, flown: TaskConfig = FLOWN) -> int:
-    return int(np.sum(cases.fly_cases(_adversary(name), flown, config).violated))
+    """Of the cases whose start the shield covers, which are nearly all; without one, of all that start outside."""
+    found = cases.fly_cases(_adversary(name), flown, config)
+    assert np.mean(found.unsafe_start) <= 0.2
+    return int(np.sum(np.asarray(found.violated) & ~np.asarray(found.unsafe_start)))
 
 
 @pytest.mark.slow
