@@ -133,7 +133,9 @@ def test_what_passes_leads_to_a_safe_state_or_is_the_brake(seed):
     fast = np.linalg.norm(np.asarray(bodies.omega_BN_B) @ oracle.INERTIA.T, axis=1) > 2.1 * 2.0 * oracle.DT
     half = SHIELD.replace(margin=0.49 * SHIELD.margin)
     safe = jax.vmap(lambda body, zone: shield.is_safe(half, body, zone, MODEL))(after, zones)
-    assert np.all(braked | np.asarray(safe) | ~fast)
+    # From inside a zone any way out is good.
+    inside = _margins(np.asarray(bodies.q_BN), np.asarray(zones.axis_N), np.asarray(zones.half_angle)) <= 1e-5
+    assert np.all(braked | np.asarray(safe) | ~fast | inside)
 
 
 def test_a_request_that_leads_to_a_safe_state_passes_to_the_last_bit():
@@ -298,7 +300,9 @@ def test_what_is_let_through_is_inside_a_box_of_unequal_limits(seed):
     fast = np.linalg.norm(np.asarray(bodies.omega_BN_B) @ oracle.INERTIA.T, axis=1) > 2.1 * min(UNEQUAL) * oracle.DT
     half = made.replace(margin=0.49 * made.margin)
     safe = jax.vmap(lambda body, zone: shield.is_safe(half, body, zone, model))(after, zones)
-    assert np.all(braked | np.asarray(safe) | ~fast)
+    # From inside a zone any way out is good.
+    inside = _margins(np.asarray(bodies.q_BN), np.asarray(zones.axis_N), np.asarray(zones.half_angle)) <= 1e-5
+    assert np.all(braked | np.asarray(safe) | ~fast | inside)
 
 
 @jax.jit
