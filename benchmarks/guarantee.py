@@ -14,23 +14,20 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import stamp
-from flax import struct
 
 from koz_jax.agents.agent import load_agent
 from koz_jax.cli.exit_status import exit_status
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.shield import ShieldConfig, UncertaintyConfig
 from koz_jax.config.task import TaskConfig
+from koz_jax.control.adversarial import AnyAdversary
 from koz_jax.control.base import Controller
 from koz_jax.control.registry import ADVERSARIAL, load_controller
 from koz_jax.evaluation.cases import fly_cases
 from koz_jax.evaluation.rollout import CaseResult
 from koz_jax.storage import runtime
-from koz_jax.task.state import EnvState, Model
 
 COMMON = ("pd", "planner", "phase2")
 ERRORS = UncertaintyConfig(inertia_error=0.1, disturbance_torque=0.01, attitude_noise_deg=0.01, rate_noise_deg=0.001)
@@ -86,27 +83,10 @@ def _zones(count: int) -> str:
     return f"{count} zone{'s' if count > 1 else ''}"
 
 
-class AnyAdversary(struct.PyTreeNode):
-    """One of the adversarial controllers, so that all are compiled once."""
-
-    which: jax.Array  # () int32
-    controllers: tuple[Any, ...]
-
-    def begin(self, state: EnvState, model: Model, key: jax.Array) -> list[Any]:
-        """Prepare all."""
-        return [one.begin(state, model, key) for one in self.controllers]
-
-    def decide(self, state: EnvState, model: Model, memory: list[Any]) -> tuple[jax.Array, list[Any]]:
-        """Ask all, and take the action (3,) of one."""
-        decided = [one.decide(state, model, kept) for one, kept in zip(self.controllers, memory, strict=True)]
-        return jnp.stack([action for action, _ in decided])[self.which], [kept for _, kept in decided]
-
-
 def controller_named(name: str) -> Controller:
     """Load a controller or the controller of an agent."""
     if name in ADVERSARIAL:
-        all_of_them = tuple(load_controller(one).controller for one in ADVERSARIAL)
-        return AnyAdversary(jnp.int32(ADVERSARIAL.index(name)), all_of_them)
+        return AnyAdversary.named(name)
     return load_agent(name).controller if name == "phase2" else load_controller(name).controller
 
 

@@ -1,9 +1,12 @@
 """Controllers that do their worst, to try the shield: none of them knows what is good for the telescope."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from flax import struct
 
+from koz_jax.control import registry
 from koz_jax.control.base import Memoryless
 from koz_jax.task import dynamics, pointing_constraints, rotations
 from koz_jax.task.state import EnvState, Model, torque_limits
@@ -71,6 +74,28 @@ class SpinUp(Memoryless):
         seconds = state.steps * model.dt
         steer = _full(_towards_zone(state), state, model)
         return jnp.where(seconds < self.spin_seconds, self.axis_B, steer), memory
+
+
+class AnyAdversary(struct.PyTreeNode):
+    """One of the adversarial controllers, chosen by a traced number, so that all are compiled once."""
+
+    which: jax.Array  # () int32
+    controllers: tuple[Any, ...]
+
+    @classmethod
+    def named(cls, name: str) -> "AnyAdversary":
+        """Choose by the name in the registry."""
+        controllers = tuple(registry.load_controller(one).controller for one in registry.ADVERSARIAL)
+        return cls(jnp.int32(registry.ADVERSARIAL.index(name)), controllers)
+
+    def begin(self, state: EnvState, model: Model, key: jax.Array) -> list[Any]:
+        """Prepare all."""
+        return [one.begin(state, model, key) for one in self.controllers]
+
+    def decide(self, state: EnvState, model: Model, memory: list[Any]) -> tuple[jax.Array, list[Any]]:
+        """Ask all, and take the action (3,) of one."""
+        decided = [one.decide(state, model, kept) for one, kept in zip(self.controllers, memory, strict=True)]
+        return jnp.stack([action for action, _ in decided])[self.which], [kept for _, kept in decided]
 
 
 def _towards_zone(state: EnvState) -> jax.Array:

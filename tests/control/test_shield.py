@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import struct
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import oracle, states
@@ -16,7 +15,8 @@ from koz_jax.agents.agent import load_agent
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.shield import ShieldConfig, UncertaintyConfig
 from koz_jax.config.task import SpacecraftConfig, TaskConfig
-from koz_jax.control.registry import ADVERSARIAL, load_controller
+from koz_jax.control.adversarial import AnyAdversary
+from koz_jax.control.registry import ADVERSARIAL
 from koz_jax.control.shield import brake_path
 from koz_jax.control.shield import filter as shield
 from koz_jax.control.shield.filter import Shield
@@ -29,7 +29,7 @@ from koz_jax.task.environment import Reorientation
 from koz_jax.task.observation_layout import ABSENT_HALF_ANGLE
 from koz_jax.task.pointing_constraints import PointingConstraint
 from koz_jax.task.scenario import Scenario
-from koz_jax.task.state import EnvState, Model
+from koz_jax.task.state import Model
 
 TASK = TaskConfig()
 MODEL = states.MODEL
@@ -193,34 +193,15 @@ def test_a_start_is_flown_as_it_is_given_and_told_where_it_is_not_covered(env):
     assert np.all(jax.vmap(env.covers)(begun))
 
 
-class AnyAdversary(struct.PyTreeNode):
-    """One of the adversarial controllers, so that all are compiled once."""
-
-    which: jax.Array  # () int32
-    controllers: tuple[Any, ...]
-
-    def begin(self, state: EnvState, model: Model, key: jax.Array) -> list[Any]:
-        return [one.begin(state, model, key) for one in self.controllers]
-
-    def decide(self, state: EnvState, model: Model, memory: list[Any]) -> tuple[jax.Array, list[Any]]:
-        decided = [one.decide(state, model, kept) for one, kept in zip(self.controllers, memory, strict=True)]
-        return jnp.stack([action for action, _ in decided])[self.which], [kept for _, kept in decided]
-
-
 FLOWN = TASK.with_rules(zones=2, max_rate_deg=5.0).model_copy(update={"episode_seconds": 40.0})
 FREE = MonteCarloConfig(cases=40, substeps=2)
 SHIELDED = MonteCarloConfig(cases=40, substeps=2, shield=ShieldConfig())
 ROBUST = MonteCarloConfig(cases=40, substeps=2, shield=ShieldConfig(error_bounds=ERRORS), uncertainty=ERRORS)
 
 
-def _adversary(name: str) -> AnyAdversary:
-    controllers = tuple(load_controller(one).controller for one in ADVERSARIAL)
-    return AnyAdversary(jnp.int32(ADVERSARIAL.index(name)), controllers)
-
-
 def _violations(name: str, config: MonteCarloConfig, flown: TaskConfig = FLOWN) -> int:
     """Of the cases whose start the shield covers, which are nearly all; without one, of all that start outside."""
-    found = cases.fly_cases(_adversary(name), flown, config)
+    found = cases.fly_cases(AnyAdversary.named(name), flown, config)
     assert np.mean(found.unsafe_start) <= 0.2
     return int(np.sum(np.asarray(found.violated) & ~np.asarray(found.unsafe_start)))
 
@@ -379,10 +360,10 @@ def test_two_instruments_are_both_kept_out_of_their_zones(env, two_instruments, 
         constraints=jax.tree.map(lambda leaf: leaf[:, jnp.array(order)], two_instruments.constraints)
     )
     short = env.replace(episode_steps=300)
-    free, _ = _fly_all(short, _adversary("adversary"), drawn)
+    free, _ = _fly_all(short, AnyAdversary.named("adversary"), drawn)
     here = np.asarray(drawn.constraints.half_angle[:, 0]) > 0
     assert np.mean(np.asarray(free.violated)[here]) > 0.8
-    flown, histories = _fly_all(shield.under_shield(short, ShieldConfig()), _adversary("adversary"), drawn)
+    flown, histories = _fly_all(shield.under_shield(short, ShieldConfig()), AnyAdversary.named("adversary"), drawn)
     assert not np.any(flown.violated)
     assert np.mean(np.asarray(flown.intervention_rate)[here] > 0) > 0.8
     # Pair by pair, in double precision: neither instrument is kept out at the other's cost.
@@ -394,7 +375,7 @@ def test_two_instruments_are_both_kept_out_of_their_zones(env, two_instruments, 
 
 
 def test_the_margin_of_a_flight_is_the_smaller_of_both_instruments(env, two_instruments):
-    _, histories = _fly_all(env.replace(episode_steps=300), _adversary("adversary"), two_instruments)
+    _, histories = _fly_all(env.replace(episode_steps=300), AnyAdversary.named("adversary"), two_instruments)
     body = histories.state.body.q_BN
     each = jax.vmap(jax.vmap(pointing_constraints.margins, in_axes=(0, None)))(body, two_instruments.constraints)
     np.testing.assert_allclose(histories.zone_margin, np.min(each, axis=2), atol=1e-6)
