@@ -1,7 +1,9 @@
 """What the tests share."""
 
+import gc
 import os
 from collections.abc import Iterator
+from pathlib import Path
 
 # Numbers are compared with those of the CPU: also where a GPU is present, and in subprocesses.
 os.environ["JAX_PLATFORMS"] = os.environ.get("KOZ_JAX_TEST_PLATFORM", "cpu")
@@ -19,6 +21,20 @@ runtime.keep_programs()
 # The first example of a property compiles; a deadline would measure that.
 settings.register_profile("koz_jax", deadline=None, derandomize=True, max_examples=50)
 settings.load_profile("koz_jax")
+
+
+# Linux lets a process map 65,530 pieces of memory.  Every compiled program takes some, and past the limit XLA crashes.
+_MANY_MAPPINGS = 20_000
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_programs() -> Iterator[None]:
+    """Forget what was compiled after a file of tests, where a worker has come to hold much."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > _MANY_MAPPINGS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="module")
