@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+
 from koz_jax.config.task import SpacecraftConfig, TaskConfig
 from koz_jax.task import dynamics, rotations, units
 from koz_jax.task.dynamics import RigidBodyState
@@ -37,7 +38,7 @@ def test_the_axes_are_the_bodys_for_an_instrument_along_x_and_a_rotation_also_al
 
 def test_the_axes_are_a_continuous_function_of_the_instrument():
     away = _DIRECTIONS[_DIRECTIONS[:, 0] > -0.9]
-    nudged = jax.vmap(rotations.normalize)(away + 1e-3 * jnp.array([0.3, -0.5, 0.8]))
+    nudged = jax.vmap(rotations.normalize)(away + 1e-3 * jnp.array([[0.3, -0.5, 0.8]]))
     change = jax.vmap(units.policy_axes)(nudged) - jax.vmap(units.policy_axes)(away)
     assert float(jnp.abs(change).max()) < 0.02
 
