@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from koz_jax.agents.flight import fly as fly
     from koz_jax.agents.numpy_policy import load_policy as load_policy
     from koz_jax.agents.record import shipped_agents as shipped_agents
-    from koz_jax.config.maneuver import ManeuverConfig as ManeuverConfig
-    from koz_jax.config.maneuver_file import load_maneuver as load_maneuver
+    from koz_jax.config.maneuvers.maneuver import ManeuverConfig as ManeuverConfig
+    from koz_jax.config.maneuvers.maneuver_file import load_maneuver as load_maneuver
     from koz_jax.config.monte_carlo import MonteCarloConfig as MonteCarloConfig
     from koz_jax.config.presets import preset as preset
     from koz_jax.config.shield import ShieldConfig as ShieldConfig
@@ -62,8 +62,8 @@ _HOME = {
     "fly_case": "evaluation.cases",
     "fly_scenario": "evaluation.cases",
     "maneuver": "task.maneuver",
-    "ManeuverConfig": "config.maneuver",
-    "load_maneuver": "config.maneuver_file",
+    "ManeuverConfig": "config.maneuvers.maneuver",
+    "load_maneuver": "config.maneuvers.maneuver_file",
     "fly": "agents.flight",
     "summarise": "evaluation.summary",
     "table": "evaluation.summary",

@@ -39,8 +39,24 @@ class Agent:
         further zone that the agent sees.  Returns (3,) or (batch, 3) in [-1, 1]; times the torque limits that is the
         torque in body axes.
         """
-        observed = as_observations(observations, self.controller.network.observed_zones)
+        network = self.controller.network
+        observed = as_observations(observations, network.observed_zones, network.scaled)
         return np.asarray(_act(self.controller, observed))
+
+    def with_urgency(self, urgency: float) -> "Agent":
+        """The same agent in more or less of a hurry.
+
+        urgency: from 0 (thrifty) to 1 (as fast as the torque allows).
+
+        Raises:
+            SettingsError: it is not in [0, 1], or the agent was not trained to listen to it.
+
+        """
+        if not self.controller.network.scaled:
+            raise SettingsError(f"urgency: {self.name} was trained for one trade of time against effort; got {urgency}")
+        if not 0.0 <= urgency <= 1.0:
+            raise SettingsError(f"urgency: must be in [0, 1], got {urgency}")
+        return dataclasses.replace(self, controller=self.controller.replace(urgency=jnp.float32(urgency)))
 
     def to_numpy(self) -> NumpyPolicy:
         """The deterministic policy without jax, as ``numpy_policy.load_policy`` reads it."""
@@ -89,7 +105,9 @@ def load_agent(
     record = read_agent_record(folder)
     template = jax.eval_shape(
         functools.partial(policy_network(record.network).init, jax.random.key(0)),
-        jax.ShapeDtypeStruct((observation_layout.size(record.network.observed_zones),), np.float32),
+        jax.ShapeDtypeStruct(
+            (observation_layout.size(record.network.observed_zones, record.network.scaled),), np.float32
+        ),
     )
     policy = archive.load_tree(folder, template)
     return Agent(PolicyController(policy, record.network), record.task, record.provenance, str(name))

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from koz_jax.agents.agent import load_agent
-from koz_jax.config.maneuver import ManeuverConfig
+from koz_jax.config.maneuvers.maneuver import ManeuverConfig
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.control.base import TaskController

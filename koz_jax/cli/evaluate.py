@@ -11,17 +11,26 @@ from koz_jax.cli.exit_status import exit_status
 from koz_jax.cli.flags import parsing
 from koz_jax.cli.flags.flight import AgentFlags, FlightFlags
 from koz_jax.cli.flags.process import ProcessFlags
+from koz_jax.config.maneuvers.maneuver_file import load_spacecraft
+from koz_jax.config.spread import SpreadConfig
+from koz_jax.config.task import TaskConfig
 from koz_jax.errors import SettingsError
 
 if TYPE_CHECKING:
-    from koz_jax.config.task import TaskConfig
     from koz_jax.control.base import TaskController
     from koz_jax.evaluation.monte_carlo import MonteCarlo
+
+
+# Another spacecraft in every case.
+_ANY_SPACECRAFT = TaskConfig(spread=SpreadConfig(spacecraft=True))
 
 
 class EvaluateFlags(ProcessFlags, FlightFlags, AgentFlags):
     """Fly a trained agent, or another controller, over many random cases; print the paper's table beside its own."""
 
+    spacecraft: str | None = None
+    """Fly another spacecraft than the agent's in the paper's draw, times in its own units: a TOML file with a table
+    [spacecraft] and step_seconds, such as a maneuver file; or "random", another one in every case."""
     json_file: Path | None = parsing.named("json", "Write the results as JSON.")
     csv: Path | None = None
     """Write a row per case."""
@@ -34,6 +43,19 @@ class EvaluateFlags(ProcessFlags, FlightFlags, AgentFlags):
     """Fly only this case of the draw, and write its history."""
     history: Path | None = None
     """File for --replay-case; by default case-I.csv."""
+
+    def task(self, agent: TaskController) -> TaskConfig:
+        """What is flown: the agent's task, or the paper's draw for another spacecraft, with the changes of the flags.
+
+        Raises:
+            SettingsError: the file cannot be read, or a change is not allowed.
+
+        """
+        if self.spacecraft is None:
+            return super().task(agent)
+        return super().changed(
+            _ANY_SPACECRAFT if self.spacecraft == "random" else load_spacecraft(self.spacecraft).task
+        )
 
 
 def main(argv: Sequence[str]) -> int:

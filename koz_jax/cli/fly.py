@@ -17,7 +17,7 @@ from koz_jax.cli.flags import parsing
 from koz_jax.cli.flags.flight import AGENT, CONTROLLERS
 from koz_jax.cli.flags.one_case import OneCaseFlags
 from koz_jax.cli.flags.turn import TurnFlags
-from koz_jax.config.maneuver import ManeuverConfig
+from koz_jax.config.maneuvers.maneuver import ManeuverConfig
 from koz_jax.config.monte_carlo import MonteCarloConfig
 
 if TYPE_CHECKING:

@@ -3,6 +3,9 @@
 Random search over the logarithms of the gains, with a spread that shrinks from round to round.  Every candidate flies
 the same cases, drawn with a seed that is not the one controllers are judged with.  The score is the mean of the paper's
 reward, to which a case that enters the zone adds nothing: by the reward alone it pays to cut through.
+
+What is flown is the paper's task.  Gains are in units of T = sqrt(J / u) and of radians, so that what is found there is
+for every spacecraft of such a shape; ``control/feedback.py`` says what long time steps make of them.
 """
 
 from __future__ import annotations

@@ -2,8 +2,11 @@
 
 from koz_jax.config.base import constant
 from koz_jax.config.curriculum import CurriculumConfig, PhaseConfig
+from koz_jax.config.spread import SpreadConfig
+from koz_jax.config.task import TaskConfig
 from koz_jax.config.training import (
     NO_ENCODING,
+    EncodingConfig,
     NetworkConfig,
     RefineConfig,
     SacConfig,
@@ -106,6 +109,47 @@ def _thorough() -> TrainConfig:
     )
 
 
+def _universal() -> TrainConfig:
+    """An agent for any spacecraft: it is drawn anew for every maneuver, with a rate limit and an urgency."""
+    fast = _fast()
+    phases = fast.curriculum
+    # Soft Actor-Critic has only to find the way around; refinement does the rest.
+    shorter = CurriculumConfig(
+        phase1=phases.phase1.model_copy(update={"updates": 32_000}),
+        phase2=phases.phase2.model_copy(update={"updates": 64_000}),
+    )
+    return fast.model_copy(
+        update={
+            "preset": "universal",
+            "curriculum": shorter,
+            "task": TaskConfig(
+                spread=SpreadConfig(
+                    spacecraft=True, step_shares=(0.014, 0.06), max_rate_deg=(2.0, 60.0), urgency=(0.0, 1.0)
+                )
+            ),
+            "eval_cases": 400,
+            "refine_eval_every": 250,
+            "network": NetworkConfig(
+                hidden_sizes=(128, 128), encoding=EncodingConfig(rate_scales=(0.016, 0.16)), scaled=True
+            ),
+            "refine": fast.refine.model_copy(
+                update={
+                    "horizon_seconds": 40.0,
+                    "learning_rate": 2e-3,
+                    "effort_weight": 3.46,
+                    "urgency_factor": 11.5,
+                    "rate_weight": 20.0,
+                    "max_maneuver_gradient": 0.1,
+                    "state_gradient": (1.0, 300.0),
+                    "max_gradient_norm": 1.0,
+                    "scenarios": 96,
+                    "iterations": 2000,
+                }
+            ),
+        }
+    )
+
+
 def _short() -> TrainConfig:
     """The fast preset in less than half of its time, for a first look and for notebooks."""
     fast = _fast()
@@ -149,7 +193,7 @@ def _smoke() -> TrainConfig:
     )
 
 
-PRESETS = {config.preset: config for config in (_fast(), _short(), _smoke(), _thorough(), _paper())}
+PRESETS = {config.preset: config for config in (_fast(), _short(), _smoke(), _thorough(), _universal(), _paper())}
 
 
 def preset(name: str) -> TrainConfig:

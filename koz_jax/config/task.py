@@ -17,6 +17,7 @@ from koz_jax.config.base import (
     ZoneCount,
     check_steps,
 )
+from koz_jax.config.spread import SpreadConfig
 from koz_jax.errors import SettingsError
 
 
@@ -39,12 +40,24 @@ class SpacecraftConfig(Settings):
     """Unit vector of the telescope in body axes."""
     torque_limit: TorqueLimit = 2.0
     """Largest torque about each body axis [N m]: one number for all, or one for each."""
+    max_rate_deg: PositiveFloat | None = None
+    """Largest norm of the body rate [deg/s], for agents that keep one; None sets no limit."""
 
     @property
     def torque_limits(self) -> Vector:
         """Largest torque about each body axis [N m]."""
         limit = self.torque_limit
         return limit if isinstance(limit, tuple) else (limit, limit, limit)
+
+    @property
+    def time_unit(self) -> float:
+        """T = sqrt(J / u) [s], J a third of the inertia's trace, u the strength."""
+        return float(np.sqrt(np.trace(np.array(self.inertia)) / 3.0 / self.strength))
+
+    @property
+    def strength(self) -> float:
+        """u [N m], the root mean square of the torque limits."""
+        return float(np.sqrt(np.mean(np.square(self.torque_limits))))
 
     @model_validator(mode="after")
     def _physical(self) -> Self:
@@ -129,6 +142,8 @@ class TaskConfig(Settings):
     """What a step is worth."""
     scenario: ScenarioConfig = ScenarioConfig()
     """Where maneuvers start, and the zone in their way."""
+    spread: SpreadConfig = SpreadConfig()
+    """What else is drawn anew for every maneuver."""
     step_seconds: PositiveFloat = 0.1
     """Time step; the torque is held over it [s]."""
     episode_seconds: PositiveFloat = 100.0
@@ -137,9 +152,25 @@ class TaskConfig(Settings):
     """phi is the full rotation angle, or half of it (the literal equation of the paper)."""
 
     @property
+    def shortest_step_seconds(self) -> float:
+        """Shortest time step that is flown [s]."""
+        spread = self.spread
+        return spread.step_shares[0] * self.spacecraft.time_unit if spread.spacecraft else self.step_seconds
+
+    @property
     def episode_steps(self) -> int:
         """Steps of a maneuver."""
-        return round(self.episode_seconds / self.step_seconds)
+        return round(self.episode_seconds / self.shortest_step_seconds)
+
+    @property
+    def time_to_paper(self) -> float:
+        """Factor that takes times to those of the paper's spacecraft, so that results compare."""
+        return SpacecraftConfig().time_unit / self.spacecraft.time_unit
+
+    @property
+    def effort_to_paper(self) -> float:
+        """Factor that takes control efforts, u^2 T in units, to those of the paper's spacecraft."""
+        return (SpacecraftConfig().strength / self.spacecraft.strength) ** 2 * self.time_to_paper
 
     def with_rules(
         self,

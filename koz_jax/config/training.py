@@ -51,6 +51,9 @@ class NetworkConfig(Settings):
     """What the networks see besides the observation."""
     observed_zones: ZoneCount = 1
     """Zones in the observation, the nearest first."""
+    scaled: bool = False
+    """See any spacecraft in units and axes of its own, and command angular acceleration; scales of rates are then in
+    1/T, T = sqrt(J / u).  Otherwise the policy is of one spacecraft, as the paper's."""
 
 
 class SacConfig(Settings):
@@ -88,6 +91,11 @@ class RefineConfig(Settings):
     max_gradient_norm: PositiveFloat = 0.03
     """Larger gradients are scaled down to this norm.  Nearly all are: a maneuver that hesitates in front of the zone
     has a huge gradient, which must not outvote the others."""
+    max_maneuver_gradient: NonNegativeFloat = 0.0
+    """The same for each maneuver by itself, so that all have a say; one that is not finite is left out.  0 does not."""
+    state_gradient: tuple[PositiveFloat, PositiveFloat] | None = None
+    """Bound on the gradient that passes back from step to step, at the first and at the last iteration: a policy that
+    chatters has useful gradients over few steps only.  None sets no bound."""
     min_angle_deg: DeviationDeg = 30.0
     """Smallest initial deviation [deg]."""
     max_angle_deg: DeviationDeg = 180.0
@@ -98,6 +106,10 @@ class RefineConfig(Settings):
     """Weight of each scale of the pointing cost, per step."""
     effort_weight: NonNegativeFloat = 5.0
     """Cost per step of the squared action: trades effort against time."""
+    urgency_factor: PositiveFloat = 1.0
+    """Factor on that weight at urgency 0, and its inverse at urgency 1; 1 trains one trade only."""
+    rate_weight: NonNegativeFloat = 0.0
+    """Cost per step of a rate at its limit."""
     zone_weight: NonNegativeFloat = 2.0
     """Weight of the zone penalty."""
     zone_tightening_deg: NonNegativeFloat = 1.0

@@ -15,6 +15,7 @@ from flax import struct
 from jax.sharding import Mesh, PartitionSpec
 
 from koz_jax.config.monte_carlo import MonteCarloConfig
+from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import TaskConfig, check_feasible
 from koz_jax.control.base import Controller, TaskController
 from koz_jax.control.registry import as_task_controller
@@ -36,6 +37,9 @@ _PURPOSE = 0x4D43
 # Separates what is random in flight from the draw of the cases.
 _IN_FLIGHT = 0x464C59
 
+# Separates what is drawn for a case besides its scenario.
+_SPREAD = 0x535052
+
 
 @dataclasses.dataclass(frozen=True)
 class Flown:
@@ -53,6 +57,7 @@ class _Flight(struct.PyTreeNode):
     controller: Controller
     key: jax.Array  # () typed PRNG key of the draw
     substeps: int = struct.field(pytree_node=False)
+    shield: ShieldConfig | None = struct.field(pytree_node=False)
 
     def case(self, index: jax.Array | int) -> Scenario:
         """Draw one case.  index: () int."""
@@ -61,6 +66,10 @@ class _Flight(struct.PyTreeNode):
     def flight_key(self, index: jax.Array | int) -> jax.Array:
         """Key of what is random while a case is flown.  index: () int."""
         return _flight_key(self.key, index)
+
+    def of_case(self, index: jax.Array | int) -> "_Flight":
+        """The flight with all that is drawn for a case.  index: () int."""
+        return self.replace(env=_of_case(self.env, self.key, index, self.shield))
 
     def evaluate(self, drawn: Scenario, key: jax.Array) -> CaseResult:
         return rollout.run_case(self.env, self.controller, drawn, self.substeps, key)
@@ -86,12 +95,21 @@ def _key(config: MonteCarloConfig) -> jax.Array:
     return jax.random.fold_in(jax.random.key(config.seed), _PURPOSE)
 
 
+def _of_case(env: Reorientation, key: jax.Array, index: jax.Array | int, shield: ShieldConfig | None) -> Reorientation:
+    """An environment with all that is drawn for a case, and the shield of the spacecraft that is drawn."""
+    if env.spread is None:
+        return env
+    return under_shield(env.drawn(jax.random.fold_in(jax.random.fold_in(key, _SPREAD), index)), shield)
+
+
 def _flight_key(key: jax.Array, index: jax.Array | int) -> jax.Array:
     return jax.random.fold_in(jax.random.fold_in(key, _IN_FLIGHT), index)
 
 
 def _flight(controller: Controller, task: TaskConfig, config: MonteCarloConfig) -> _Flight:
-    return _Flight(environment(task, config), controller, _key(config), config.substeps)
+    env = environment(task, config)
+    # Where every case has a spacecraft of its own, it also has a shield of its own.
+    return _Flight(env, controller, _key(config), config.substeps, None if env.spread is None else config.shield)
 
 
 def draw_case(task: TaskConfig, config: MonteCarloConfig, case: jax.Array | int) -> Scenario:
@@ -102,7 +120,7 @@ def draw_case(task: TaskConfig, config: MonteCarloConfig, case: jax.Array | int)
 
     """
     check_feasible(task, config.max_angle_deg)
-    return environment(task, config).sample(jax.random.fold_in(_key(config), case))
+    return _of_case(environment(task, config), _key(config), case, None).sample(jax.random.fold_in(_key(config), case))
 
 
 @functools.partial(jax.jit, static_argnames="mesh")
@@ -110,7 +128,8 @@ def _fly_cases(flight: _Flight, cases: jax.Array, *, mesh: Mesh) -> CaseResult:
     """cases: (devices * n,) int32 indices.  Returns leaves of the same length."""
 
     def one(case: jax.Array) -> CaseResult:
-        return flight.evaluate(flight.case(case), flight.flight_key(case))
+        own = flight.of_case(case)
+        return own.evaluate(own.case(case), own.flight_key(case))
 
     def on_one_device(cases: jax.Array) -> CaseResult:
         return jax.lax.map(one, cases, batch_size=_CHUNK)
@@ -197,7 +216,7 @@ def fly_scenario(
     maneuver.tell_of_another_boresight(right, flown.spacecraft.boresight)
     cautions.warn_of_differences(flying, flown)
     cautions.warn_of_target(flying, right, how.shield)
-    flight = _flight(flying.controller, flown, how)
+    flight = _flight(flying.controller, flown, how).of_case(case)
     return _keep_and_evaluate(flight, right, flight.flight_key(case))
 
 
@@ -211,7 +230,8 @@ def within_steps(history: History, task: TaskConfig, config: MonteCarloConfig, c
 
     Returns leaves (steps * substeps + 1, ...), with the settings' ``substeps``.
     """
-    return _within_steps(environment(task, config), history, _flight_key(_key(config), case), config.substeps)
+    env = _of_case(environment(task, config), _key(config), case, config.shield)
+    return _within_steps(env, history, _flight_key(_key(config), case), config.substeps)
 
 
 @functools.partial(jax.jit, static_argnames="substeps")

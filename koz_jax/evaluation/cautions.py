@@ -37,7 +37,7 @@ def warn_of_differences(agent: TaskController, task: TaskConfig) -> None:
     """Warn, in one line, of all in which a task differs from the one that an agent was trained for."""
     if not isinstance(agent.controller, PolicyController):
         return
-    found = differences(agent.task, task)
+    found = [] if agent.controller.network.scaled else differences(agent.task, task)
     seen = agent.controller.network.observed_zones
     if seen < task.scenario.max_zones:
         nearest = "the nearest zone" if seen == 1 else f"the nearest {seen} zones"

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from koz_jax.config.maneuver import ManeuverConfig
+from koz_jax.config.maneuvers.maneuver import ManeuverConfig
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.task import TaskConfig
 from koz_jax.control.base import TaskController
@@ -79,6 +79,8 @@ def config_of(maneuver: ManeuverConfig, config: MonteCarloConfig) -> MonteCarloC
 def unfamiliar(agent: TaskController, maneuver: ManeuverConfig) -> list[str]:
     """What a trained agent was not made for, in words; empty where it was, and for controllers of any spacecraft."""
     if not isinstance(agent.controller, PolicyController):
+        return []
+    if agent.controller.network.scaled:
         return []
     found = cautions.differences(agent.task, maneuver.task)
     looks = {tuple(maneuver.boresight(one.instrument).tolist()) for one in maneuver.constraints}

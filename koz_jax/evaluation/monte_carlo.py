@@ -92,7 +92,11 @@ def monte_carlo(
 
 def report(flown: MonteCarlo, summary: Summary) -> dict[str, float | int | str | None]:
     """Put the results into a JSON object (keys as in the documentation of ``eval_mc.py``); nan becomes null."""
-    rows = {name: None if math.isnan(value) else value for name, value in vars(summary).items()}
+    scaled = {
+        "settling_time_scaled_mean": summary.settling_time_mean * flown.task.time_to_paper,
+        "control_effort_scaled_mean": summary.control_effort_mean * flown.task.effort_to_paper,
+    }
+    rows = {name: None if math.isnan(value) else value for name, value in (vars(summary) | scaled).items()}
     return {
         "cases": flown.config.cases,
         "seed": flown.config.seed,

@@ -7,10 +7,10 @@ from flax import struct
 from koz_jax.control.base import Controller, Memory
 from koz_jax.task import reward
 from koz_jax.task.dynamics import RigidBodyState
-from koz_jax.task.environment import Reorientation, Step
+from koz_jax.task.environment import Reorientation
 from koz_jax.task.reward import RewardTerms
 from koz_jax.task.scenario import Scenario
-from koz_jax.task.state import EnvState, Truth, attitude_error, propagate
+from koz_jax.task.state import EnvState, Step, Truth, attitude_error, propagate
 
 
 class CaseResult(struct.PyTreeNode):

@@ -7,9 +7,12 @@ reward has steps (settled or not, progress or not) that have no gradient; the co
 """
 
 import functools
+from collections.abc import Callable
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import struct
 
@@ -18,10 +21,21 @@ from koz_jax.control.policy import PolicyController
 from koz_jax.control.shield.filter import under_shield
 from koz_jax.learning.train_step import MAX_DRAWS
 from koz_jax.sac.networks import Params
+from koz_jax.task import rotations
+from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.environment import Reorientation
 from koz_jax.task.reward import Outcome
 from koz_jax.task.scenario import SamplingRule
 from koz_jax.task.state import EnvState
+
+Tree = TypeVar("Tree")
+
+# Separates what is drawn for a maneuver besides its scenario.
+_SPREAD = 0x535052
+
+# Share of the rate limit from which a rate costs something, and how fast that grows.
+_RATE_KEPT = 0.95
+_RATE_WIDTH = 0.02
 
 
 class RefineState(struct.PyTreeNode):
@@ -57,6 +71,18 @@ def zone_cost(margin: jax.Array, decay: jax.Array, tightening: jax.Array) -> jax
     return jnp.exp(-decay * jnp.maximum(outside, 0.0)) + decay * jnp.maximum(-outside, 0.0)
 
 
+def effort_weight(env: Reorientation, config: RefineConfig) -> jax.Array:
+    """Cost per step of the squared action at the urgency of an environment.  Returns ()."""
+    return config.effort_weight * config.urgency_factor ** (1.0 - 2.0 * env.urgency)
+
+
+def rate_cost(rate: jax.Array, limit: jax.Array) -> jax.Array:
+    """Cost of a rate near its limit: small up to 0.9 of it, 1 at the limit, then linear.  rate, limit: () [rad/s]."""
+    return jax.nn.softplus((rate / limit - _RATE_KEPT) / _RATE_WIDTH) / np.log1p(
+        np.exp((1.0 - _RATE_KEPT) / _RATE_WIDTH)
+    )
+
+
 def step_cost(outcome: Outcome, env: Reorientation, config: RefineConfig) -> jax.Array:
     """Smooth cost of one step: pointing at several resolutions, effort, and the zone.  Returns ()."""
     phi = env.reward.angle_factor * outcome.angle
@@ -70,7 +96,7 @@ def step_cost(outcome: Outcome, env: Reorientation, config: RefineConfig) -> jax
         env.reward.zone_decay * config.zone_steepness,
         jnp.deg2rad(config.zone_tightening_deg),
     )
-    return pointing + config.effort_weight * squared_action + config.zone_weight * env.reward.zone_height * zone
+    return pointing + effort_weight(env, config) * squared_action + config.zone_weight * env.reward.zone_height * zone
 
 
 def maneuver_environment(config: TrainConfig) -> Reorientation:
@@ -78,18 +104,79 @@ def maneuver_environment(config: TrainConfig) -> Reorientation:
     rule = SamplingRule(config.task.scenario.infeasible_zone, MAX_DRAWS, keep_angle=True)
     angles = (config.refine.min_angle_deg, config.refine.max_angle_deg)
     env = Reorientation.from_config(config.task, *angles, rule=rule, observed_zones=config.network.observed_zones)
-    return under_shield(env, config.shielding.in_force)
+    return env.replace(scaled=config.network.scaled)
 
 
-def maneuver_cost(controller: PolicyController, env: Reorientation, key: jax.Array, config: TrainConfig) -> jax.Array:
-    """Mean cost per step of one random maneuver over the horizon; differentiable in the controller.  Returns ()."""
+def maneuver_cost(
+    controller: PolicyController,
+    env: Reorientation,
+    key: jax.Array,
+    config: TrainConfig,
+    reach: jax.Array | None = None,
+) -> jax.Array:
+    """Mean cost per step of one random maneuver over the horizon; differentiable in the controller.
+
+    reach: () largest norm of the gradient that passes back from step to step, None for any.  Returns ().
+    """
+    env = under_shield(env.drawn(jax.random.fold_in(key, _SPREAD)), config.shielding.in_force)
 
     def advance(state: EnvState, _: None) -> tuple[EnvState, jax.Array]:
+        state = state if reach is None else state.replace(body=_limit_gradient(state.body, reach))
         stepped = env.step(state, controller.act(env.observe(state)))
-        return stepped.state, step_cost(stepped.outcome, env, config.refine)
+        cost = step_cost(stepped.outcome, env, config.refine)
+        if env.model.max_rate is not None:
+            rate = rotations.norm(stepped.state.body.omega_BN_B)
+            cost = cost + config.refine.rate_weight * rate_cost(rate, env.model.max_rate)
+        return stepped.state, cost
 
     _, costs = jax.lax.scan(advance, env.reset(key), None, length=config.refine_steps)
-    return jnp.mean(costs)
+    return jnp.mean(costs) * (env.model.dt / config.task.step_seconds)
+
+
+@jax.custom_vjp
+def _limit_gradient(body: RigidBodyState, limit: jax.Array) -> RigidBodyState:
+    """Return the state as it is, but scale the gradient that comes back down to a norm; 0 where it is not finite."""
+    return body
+
+
+def _limit_gradient_forward(body: RigidBodyState, limit: jax.Array) -> tuple[RigidBodyState, jax.Array]:
+    return body, limit
+
+
+def _limit_gradient_backward(limit: jax.Array, gradient: RigidBodyState) -> tuple[RigidBodyState, jax.Array]:
+    return _clipped(gradient, limit), jnp.zeros_like(limit)
+
+
+_limit_gradient.defvjp(_limit_gradient_forward, _limit_gradient_backward)
+
+
+def _clipped(gradient: Tree, limit: jax.Array | float) -> Tree:
+    """A gradient scaled down to a norm; 0 where it is not finite."""
+    size = optax.tree.norm(gradient)
+    share = jnp.where(size < limit, 1.0, limit / jnp.where(size > 0.0, size, 1.0))
+    return jax.tree.map(lambda leaf: jnp.where(jnp.isfinite(size), share * leaf, 0.0), gradient)
+
+
+def _reach(config: RefineConfig, iteration: jax.Array) -> jax.Array | None:
+    """How large a gradient passes back from step to step at an iteration.  Returns ()."""
+    if config.state_gradient is None:
+        return None
+    first, last = config.state_gradient
+    return first * (last / first) ** (iteration / max(config.iterations, 1))
+
+
+def _mean_gradient(
+    cost_of: Callable[[Params, jax.Array], jax.Array], policy: Params, keys: jax.Array, config: RefineConfig
+) -> tuple[jax.Array, Params]:
+    """Mean over maneuvers of the cost and of its gradient, each maneuver's clipped where the settings say so."""
+    if not config.max_maneuver_gradient:
+        return jax.value_and_grad(lambda policy: jnp.mean(jax.vmap(lambda key: cost_of(policy, key))(keys)))(policy)
+
+    def one(key: jax.Array) -> tuple[jax.Array, Params]:
+        cost, gradient = jax.value_and_grad(cost_of)(policy, key)
+        return cost, _clipped(gradient, config.max_maneuver_gradient)
+
+    return jax.tree.map(lambda leaf: jnp.mean(leaf, axis=0), jax.vmap(one)(keys))
 
 
 @functools.partial(jax.jit, static_argnames="config", donate_argnames="state")
@@ -97,16 +184,15 @@ def refine_chunk(config: TrainConfig, state: RefineState, iterations: jax.Array)
     """Take ``iterations`` gradient steps (traced).  Returns the new state and the mean cost ()."""
     env = maneuver_environment(config)
 
-    def mean_cost(policy: Params, keys: jax.Array) -> jax.Array:
-        controller = PolicyController(policy, config.network)
-        return jnp.mean(jax.vmap(lambda key: maneuver_cost(controller, env, key, config))(keys))
-
     def body(_: jax.Array, carry: tuple[RefineState, jax.Array]) -> tuple[RefineState, jax.Array]:
         state, total = carry
         key, key_cases = jax.random.split(state.key)
-        cost, gradient = jax.value_and_grad(mean_cost)(
-            state.policy, jax.random.split(key_cases, config.refine.scenarios)
-        )
+        keys, reach = jax.random.split(key_cases, config.refine.scenarios), _reach(config.refine, state.iterations)
+
+        def cost_of(policy: Params, key: jax.Array) -> jax.Array:
+            return maneuver_cost(PolicyController(policy, config.network), env, key, config, reach)
+
+        cost, gradient = _mean_gradient(cost_of, state.policy, keys, config.refine)
         change, optimizer = _optimizer(config.refine).update(gradient, state.optimizer)
         policy = optax.apply_updates(state.policy, change)
         return RefineState(policy, optimizer, key, state.iterations + 1), total + cost

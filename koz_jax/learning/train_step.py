@@ -17,6 +17,7 @@ from koz_jax.sac.learner import LearnerMetrics, LearnerState, Sac
 from koz_jax.sac.losses import Batch
 from koz_jax.sac.replay_buffer import ReplayBuffer, Transition
 from koz_jax.task import observation_layout, reward
+from koz_jax.task.any_spacecraft import units
 from koz_jax.task.environment import Reorientation
 from koz_jax.task.observation_layout import ACTION_SIZE
 from koz_jax.task.reward import RewardTerms
@@ -28,6 +29,9 @@ MAX_DRAWS = 8
 
 # Episodes start in so many groups, spread over an episode, so that the buffer holds all parts of a maneuver.
 _START_GROUPS = 16
+
+# Separates what is drawn for an episode from everything else that is random.
+_SPREAD = 0x535052
 
 
 class TrainState(struct.PyTreeNode):
@@ -53,7 +57,8 @@ def make_sac(config: TrainConfig) -> Sac:
     return Sac(
         hidden_sizes=config.network.hidden_sizes,
         encoding=encoding.views(config.network),
-        observation_size=observation_layout.size(config.network.observed_zones),
+        dials=encoding.dials(config.network),
+        observation_size=observation_layout.size(config.network.observed_zones, config.network.scaled),
         action_size=ACTION_SIZE,
         target_entropy=config.sac.target_entropy,
         soft_update=config.sac.soft_update,
@@ -66,8 +71,12 @@ def training_environment(config: TrainConfig) -> Reorientation:
     """Set up what is trained in; the curriculum sets the deviations, see ``at_difficulty``."""
     rule = SamplingRule(config.task.scenario.infeasible_zone, MAX_DRAWS, keep_angle=True)
     env = Reorientation.from_config(config.task, rule=rule, observed_zones=config.network.observed_zones)
-    env = env.replace(episode_steps=config.training_episode_steps)
-    return under_shield(env, config.shielding.in_force)
+    env = env.replace(episode_steps=config.training_episode_steps, scaled=config.network.scaled)
+    if env.spread is not None:
+        # What a step is worth must be the same for all: the time step is not spread here, only in refinement.
+        own = env.model.dt / units.of(env.model).time
+        env = env.replace(spread=env.spread.replace(step_shares=jnp.stack([own, own])))
+    return env
 
 
 def at_difficulty(env: Reorientation, at: Difficulty) -> Reorientation:
@@ -76,13 +85,36 @@ def at_difficulty(env: Reorientation, at: Difficulty) -> Reorientation:
     return env.replace(ranges=ranges)
 
 
+def _head_starts(config: TrainConfig) -> jax.Array:
+    """Steps by which environments are ahead in their first episode.  Returns (num_envs,) int32."""
+    group = jnp.arange(config.num_envs) * _START_GROUPS // config.num_envs
+    return group * config.training_episode_steps // _START_GROUPS
+
+
+def environments_at(config: TrainConfig, env: Reorientation, step: jax.Array) -> Reorientation:
+    """The environments as they are in the episode that each is in: a stack, or one where nothing is drawn for them.
+
+    step: () int32, steps of all environments since the start of the run, the random ones included.
+    """
+    if env.spread is None:
+        return under_shield(env, config.shielding.in_force)
+    episodes = (step + _head_starts(config)) // config.training_episode_steps
+    base = jax.random.fold_in(jax.random.key(config.seed), _SPREAD)
+
+    def drawn(number: jax.Array, episode: jax.Array) -> Reorientation:
+        key = jax.random.fold_in(jax.random.fold_in(base, number), episode)
+        return under_shield(env.drawn(key), config.shielding.in_force)
+
+    return jax.vmap(drawn)(jnp.arange(config.num_envs), episodes)
+
+
 def _advance(
     config: TrainConfig, env: Reorientation, states: EnvState, action: jax.Array, key: jax.Array
 ) -> tuple[EnvState, Transition]:
     """One step of all environments; those at the end of their episode start a new scenario."""
     stepped = env.step_autoreset(states, action, lambda: jax.random.split(key, config.num_envs))
     return stepped.state, Transition(
-        observation=jax.vmap(env.observe)(states),
+        observation=env.observe_each(states),
         action=action,
         outcome=stepped.outcome,
         terminated=stepped.terminated,
@@ -98,15 +130,14 @@ def init(config: TrainConfig, key: jax.Array) -> TrainState:
     at = curriculum.difficulty(config.curriculum, jnp.zeros((), jnp.int32))
     env = at_difficulty(training_environment(config), at)
     states = jax.vmap(env.reset)(jax.random.split(key_envs, config.num_envs))
-    group = jnp.arange(config.num_envs) * _START_GROUPS // config.num_envs
-    head_start = group * config.training_episode_steps // _START_GROUPS
+    head_start = _head_starts(config)
 
-    def random_step(states: EnvState, key_step: jax.Array) -> tuple[EnvState, Transition]:
+    def random_step(states: EnvState, number: jax.Array, key_step: jax.Array) -> tuple[EnvState, Transition]:
         key_action, key_reset = jax.random.split(key_step)
         action = jax.random.uniform(key_action, (config.num_envs, ACTION_SIZE), minval=-1.0, maxval=1.0)
-        return _advance(config, env, states, action, key_reset)
+        return _advance(config, environments_at(config, env, number), states, action, key_reset)
 
-    example = jax.eval_shape(random_step, states, key_fill)[1]
+    example = jax.eval_shape(random_step, states, jnp.int32(0), key_fill)[1]
     buffer = replay_buffer.init(example, config.buffer_steps)
 
     def fill(
@@ -114,7 +145,7 @@ def init(config: TrainConfig, key: jax.Array) -> TrainState:
     ) -> tuple[tuple[EnvState, ReplayBuffer], None]:
         states, buffer = carry
         number, key_step = row
-        states, transition = random_step(states, key_step)
+        states, transition = random_step(states, number, key_step)
         # After the first step, which the environment knows by its number.
         states = states.replace(steps=states.steps + jnp.where(number == 0, head_start, 0))
         return (states, replay_buffer.insert(buffer, transition)), None
@@ -149,9 +180,11 @@ def train_step(config: TrainConfig, env: Reorientation, state: TrainState) -> tu
     key, key_action, key_reset, key_batch, key_updates = jax.random.split(state.key, 5)
 
     env = at_difficulty(env, at)
-    observed = jax.vmap(env.observe)(state.env_states)
+    step = config.prefill_steps + state.updates // config.updates_per_step
+    envs = environments_at(config, env, step)
+    observed = envs.observe_each(state.env_states)
     action, _ = sac.act(state.learner.policy, observed).sample(key_action)
-    env_states, transition = _advance(config, env, state.env_states, action, key_reset)
+    env_states, transition = _advance(config, envs, state.env_states, action, key_reset)
     buffer = replay_buffer.insert(state.buffer, transition)
 
     drawn = _rewarded_batch(config, env, buffer, at, key_batch)

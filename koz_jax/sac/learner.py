@@ -9,7 +9,7 @@ from flax import struct
 
 from koz_jax.sac import losses
 from koz_jax.sac.losses import Batch
-from koz_jax.sac.networks import Encoding, Params, Policy, SquashedGaussian, TwinCritic
+from koz_jax.sac.networks import Dials, Encoding, Params, Policy, SquashedGaussian, TwinCritic
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,11 +24,12 @@ class Sac:
     soft_update: float
     policy_average: float
     initial_entropy_coefficient: float
+    dials: Dials = ()
 
     @property
     def policy(self) -> Policy:
         """The policy network."""
-        return Policy(self.hidden_sizes, self.encoding, self.action_size)
+        return Policy(self.hidden_sizes, self.encoding, self.action_size, self.dials)
 
     @property
     def critic(self) -> TwinCritic:

@@ -9,6 +9,10 @@ from flax import struct
 
 Params = Any  # a pytree of arrays, as flax makes it
 Encoding = tuple[tuple[int, int, float], ...]  # (start, stop, scale): also feed tanh(observation[start:stop] / scale)
+Dials = tuple[tuple[int, float, float], ...]  # (entry, low, high): entries of the observation that modulate all layers
+
+# Gaussian features of a dial, evenly spaced over its range.
+DIAL_FEATURES = 5
 
 # Bounds on the policy's log standard deviation, as in Stable-Baselines3.
 LOG_STD_MIN = -20.0
@@ -44,18 +48,36 @@ def encode(observation: jax.Array, encoding: Encoding) -> jax.Array:
     return jnp.concatenate([observation, *views], axis=-1)
 
 
+def dial_features(observation: jax.Array, dials: Dials) -> jax.Array:
+    """Gaussian features of each dial.  observation: (..., n).  Returns (..., dials * DIAL_FEATURES)."""
+    features = [jnp.zeros((*observation.shape[:-1], 0))]
+    for entry, low, high in dials:
+        spacing = (high - low) / (DIAL_FEATURES - 1)
+        steps = (observation[..., entry, None] - low) / spacing - jnp.arange(DIAL_FEATURES, dtype=jnp.float32)
+        features.append(jnp.exp(-0.5 * steps**2))
+    return jnp.concatenate(features, axis=-1)
+
+
 class Mlp(nn.Module):
-    """Fully connected ReLU layers and a linear output."""
+    """Fully connected ReLU layers and a linear output; where there are dials, they shift and scale every layer."""
 
     hidden_sizes: tuple[int, ...]
     output_size: int
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        """x: (..., inputs).  Returns (..., output_size)."""
-        for size in self.hidden_sizes:
-            x = nn.relu(nn.Dense(size, kernel_init=_kernel_init)(x))
-        return nn.Dense(self.output_size, kernel_init=_kernel_init)(x)
+    def __call__(self, x: jax.Array, dialled: jax.Array | None = None) -> jax.Array:
+        """x: (..., inputs); dialled: (..., features) of the dials.  Returns (..., output_size)."""
+        for number, size in enumerate(self.hidden_sizes):
+            x = nn.Dense(size, kernel_init=_kernel_init)(_beside(x, dialled))
+            if dialled is not None:
+                gain = nn.Dense(size, use_bias=False, kernel_init=nn.initializers.zeros, name=f"Gain_{number}")
+                x = x * (1.0 + gain(dialled))
+            x = nn.relu(x)
+        return nn.Dense(self.output_size, kernel_init=_kernel_init)(_beside(x, dialled))
+
+
+def _beside(x: jax.Array, dialled: jax.Array | None) -> jax.Array:
+    return x if dialled is None else jnp.concatenate([x, dialled], axis=-1)
 
 
 class Policy(nn.Module):
@@ -64,11 +86,13 @@ class Policy(nn.Module):
     hidden_sizes: tuple[int, ...]
     encoding: Encoding
     action_size: int
+    dials: Dials = ()
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> SquashedGaussian:
         """observation: (..., n).  Returns the distribution of actions (..., action_size)."""
-        output = Mlp(self.hidden_sizes, 2 * self.action_size)(encode(observation, self.encoding))
+        dialled = dial_features(observation, self.dials) if self.dials else None
+        output = Mlp(self.hidden_sizes, 2 * self.action_size)(encode(observation, self.encoding), dialled)
         mean, log_std = jnp.split(output, 2, axis=-1)
         return SquashedGaussian(mean, jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX))
 

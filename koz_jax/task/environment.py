@@ -4,12 +4,12 @@
     state = env.reset(key)
     step = env.step(state, action)  # step.state, step.observation, step.terms, step.truncated, ...
 
-Everything is a pure function of one sample; batch it with ``vmap``.  Only ``autoreset`` and ``step_autoreset`` are of
-many environments, which share one draw of new scenarios.
+Everything is a pure function of one sample; batch it with ``vmap``.  Only ``autoreset``, ``step_autoreset`` and
+``observe_each`` are of many environments, which share one draw of new scenarios, and may be a stack of different ones.
 """
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,52 +19,12 @@ from koz_jax.config.task import TaskConfig, check_deviations, check_feasible
 from koz_jax.task import actuators, maneuver, observation, pointing_constraints, reward, rotations, scenario, state
 from koz_jax.task import uncertainty as errors
 from koz_jax.task.actuators import TorqueLimits
-from koz_jax.task.reward import Outcome, RewardParams, RewardTerms
+from koz_jax.task.any_spacecraft import nondimensional, spread
+from koz_jax.task.any_spacecraft.spread import Spread
+from koz_jax.task.reward import Outcome, RewardParams
 from koz_jax.task.scenario import SamplingRule, Scenario, ScenarioRanges
-from koz_jax.task.state import EnvState, Model, Truth, attitude_error, select_envs
+from koz_jax.task.state import ActionFilter, Command, EnvState, Model, Step, Truth, attitude_error, select_envs
 from koz_jax.task.uncertainty import Uncertainty
-
-
-class ActionFilter(Protocol):
-    """What stands between a controller and the actuators, such as the shield.  Implementations are pytrees."""
-
-    def covers(self, at: EnvState, model: Model) -> jax.Array:
-        """Whether what the filter guarantees holds from this state on.  Returns () bool."""
-        ...
-
-    def allow(self, measured: EnvState, action: jax.Array, model: Model) -> jax.Array:
-        """Action (3,) in [-1, 1] that is let through in place of the requested one (3,) in [-1, 1]."""
-        ...
-
-
-class Command(struct.PyTreeNode):
-    """What is asked of the actuators in a step, as shares of the torque limits."""
-
-    requested: jax.Array  # (3,) by the controller, clipped to [-1, 1]
-    applied: jax.Array  # (3,) after the filter
-
-    @property
-    def intervened(self) -> jax.Array:
-        """Whether the filter changed anything.  Returns () bool."""
-        return jnp.any(self.applied != self.requested)
-
-    @property
-    def change(self) -> jax.Array:
-        """What the filter changed.  Returns (3,)."""
-        return jax.lax.stop_gradient(self.applied - self.requested)
-
-
-class Step(struct.PyTreeNode):
-    """What one step gives.  The observation has 16 entries, 5 more for each zone above one that is observed."""
-
-    state: EnvState
-    observation: jax.Array  # (entries,) to act on next; of the next maneuver where ``step_autoreset`` has begun it
-    final_observation: jax.Array  # (entries,) that the step itself led to
-    command: Command
-    outcome: Outcome
-    terms: RewardTerms  # of the paper's reward, unweighted
-    terminated: jax.Array  # () bool, always false: neither settling nor a violation ends a maneuver
-    truncated: jax.Array  # () bool, the maneuver's time is up
 
 
 class Reorientation(struct.PyTreeNode):
@@ -75,8 +35,15 @@ class Reorientation(struct.PyTreeNode):
     ranges: ScenarioRanges
     action_filter: ActionFilter | None = None  # None lets every action through
     uncertainty: Uncertainty | None = None  # None flies the model itself, measured exactly
+    spread: Spread | None = None  # None flies every maneuver with the same spacecraft
+    urgency: jax.Array = struct.field(
+        default_factory=lambda: jnp.float32(0.5)
+    )  # () in [0, 1], for policies that see it
     rule: SamplingRule = struct.field(pytree_node=False, default=SamplingRule())
     observed_zones: int = struct.field(pytree_node=False, default=1)
+    scaled: bool = struct.field(
+        pytree_node=False, default=False
+    )  # observations and actions as of ``any_spacecraft.nondimensional``
     episode_steps: int = struct.field(pytree_node=False, default=1000)
 
     @classmethod
@@ -116,10 +83,19 @@ class Reorientation(struct.PyTreeNode):
             ranges=scenario.from_config(task.scenario, task.spacecraft.boresight, min_angle_deg, max_angle_deg),
             action_filter=action_filter,
             uncertainty=uncertainty,
+            spread=spread.from_config(task),
             rule=rule or SamplingRule(task.scenario.infeasible_zone),
             observed_zones=observed_zones or task.scenario.max_zones,
             episode_steps=task.episode_steps,
         )
+
+    def drawn(self, key: jax.Array) -> "Reorientation":
+        """The environment of one maneuver, in which all that is spread is drawn.  key: () typed PRNG key."""
+        if self.spread is None:
+            return self
+        found = spread.draw(self.spread, self.model, self.ranges.boresight_B, key)
+        ranges = self.ranges.replace(boresight_B=found.boresight_B)
+        return self.replace(model=found.model, ranges=ranges, urgency=found.urgency, spread=None)
 
     @property
     def nominal_limits(self) -> TorqueLimits:
@@ -143,7 +119,13 @@ class Reorientation(struct.PyTreeNode):
         return jnp.array(True) if self.action_filter is None else self.action_filter.covers(at, self.model)
 
     def observe(self, measured: EnvState) -> jax.Array:
-        """What a controller sees of a state.  Returns (16,), 5 more for each observed zone above one."""
+        """What a controller sees of a state.
+
+        Returns (16,), 5 more for each observed zone above one; where the environment is ``scaled``, what
+        ``nondimensional.observe`` gives.
+        """
+        if self.scaled:
+            return nondimensional.observe(measured, self.model, self.urgency, self.observed_zones)
         return observation.observe(measured, self.observed_zones)
 
     def sample_truth(self, key: jax.Array) -> Truth:
@@ -176,11 +158,15 @@ class Reorientation(struct.PyTreeNode):
 
         Args:
             before: where the maneuver is.
-            action: (3,) in [-1, 1] (clipped), share of the torque limits.
+            action: (3,) in [-1, 1] (clipped), share of the torque limits; where the environment is ``scaled``, as
+                of ``nondimensional.command``.
             measured: what the filter knows of the state; by default the state itself.
             truth: what flies; by default the model.
         """
-        command = self.filter(before if measured is None else measured, action)
+        known = before if measured is None else measured
+        command = self.filter(
+            known, nondimensional.command(jnp.clip(action, -1.0, 1.0), known, self.model) if self.scaled else action
+        )
         after, outcome = self._advance(before, command, state.nominal(self.model) if truth is None else truth)
         observed = self.observe(after)
         return Step(
@@ -235,18 +221,31 @@ class Reorientation(struct.PyTreeNode):
         """
 
         def restart() -> tuple[EnvState, jax.Array]:
-            fresh = jax.vmap(self.reset)(keys())
-            return select_envs(over, (fresh, jax.vmap(self.observe)(fresh)), (states, observed))
+            fresh = self._of_each(Reorientation.reset)(self, keys())
+            return select_envs(over, (fresh, self.observe_each(fresh)), (states, observed))
 
         # Drawing scenarios costs more than a step, and most steps end no maneuver.
         return jax.lax.cond(jnp.any(over), restart, lambda: (states, observed))
+
+    def observe_each(self, states: EnvState) -> jax.Array:
+        """What a controller sees of each of many states, leaves (n, ...).  Returns (n, entries)."""
+        return self._of_each(Reorientation.observe)(self, states)
+
+    def _of_each(self, method: Callable[..., Any]) -> Callable[..., Any]:
+        """Map a method over many environments: those of a stack, as ``drawn`` makes them, or all the same."""
+        stacked = self.model.dt.ndim > 0
+
+        def mapped(env: Reorientation, *states: Any) -> Any:
+            return jax.vmap(method, in_axes=(0 if stacked else None, *(0 for _ in states)))(env, *states)
+
+        return mapped
 
     def step_autoreset(self, states: EnvState, actions: jax.Array, keys: Callable[[], jax.Array]) -> Step:
         """Step many environments; where that ends a maneuver, the next one begins within the same step.
 
         states: leaves (n, ...); actions: (n, 3); keys: as of ``autoreset``.  Returns leaves (n, ...).
         """
-        stepped = jax.vmap(self.step)(states, actions)
+        stepped = self._of_each(Reorientation.step)(self, states, actions)
         next_states, observed = self.autoreset(stepped.truncated, stepped.state, stepped.final_observation, keys)
         return stepped.replace(state=next_states, observation=observed)
 
@@ -266,8 +265,10 @@ def _straight_through_jvp(
 
 def model_from_config(task: TaskConfig) -> Model:
     """The spacecraft as the settings say, float32."""
+    max_rate_deg = task.spacecraft.max_rate_deg
     return Model(
         inertia_B=jnp.array(task.spacecraft.inertia),
         actuators=actuators.from_config(task.spacecraft),
         dt=jnp.float32(task.step_seconds),
+        max_rate=None if max_rate_deg is None else jnp.deg2rad(jnp.float32(max_rate_deg)),
     )

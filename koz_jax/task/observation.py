@@ -14,7 +14,7 @@ def observe(state: EnvState, zones: int = 1) -> jax.Array:
 
     A zone after the first that is absent reads margin pi, angle pi and direction zero.
     """
-    nearest = _nearest(state, zones)
+    nearest = nearest_constraints(state, zones)
     parts = {
         "q_e": attitude_error(state),
         "omega_BN_B": state.body.omega_BN_B,
@@ -27,7 +27,7 @@ def observe(state: EnvState, zones: int = 1) -> jax.Array:
     return jnp.concatenate([parts[name] for name in layout(zones)])
 
 
-def _nearest(state: EnvState, count: int) -> PointingConstraint:
+def nearest_constraints(state: EnvState, count: int) -> PointingConstraint:
     """The zones with the smallest margins, nearest first, filled up with absent ones.  Returns leaves (count, ...)."""
     zones = state.scenario.constraints
     present = zones.count

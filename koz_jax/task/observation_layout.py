@@ -26,6 +26,23 @@ _ZONE = {
     "zone_direction_B": 3,  # unit vector from the boresight towards the zone's axis
 }
 
+_SCALED_ZONE = {"zone_margin": 1, "zone_angle": 1, "zone_direction_P": 3}
+
+# What a policy for any spacecraft also sees, after attitude, rate and zones; see ``any_spacecraft.nondimensional``.
+_SPACECRAFT = {
+    "inertia": 6,  # [J] xx, yy, zz, xy, xz, yz of the tensor
+    "reach": 3,  # [u] largest torque along each axis
+    "step": 1,  # log of the time step [T] over ``SHORTEST_STEP``
+    "rate_limit": 1,  # log of the largest rate [1/T] over ``FREE_RATE``
+    "urgency": 1,  # from -1 (thrifty) to 1 (fast)
+}
+
+# [T] A policy tells no shorter time steps apart.
+SHORTEST_STEP = 0.01
+
+# [1/T] A limit of the rate above this is none.
+FREE_RATE = 3.0
+
 # For those who only get an exported controller.
 _MEANING = {
     "q_e": "attitude error q_DN* (x) q_BN, scalar first; of it and its negative, which are one attitude, the one nearer"
@@ -36,12 +53,25 @@ _MEANING = {
     "zone_angle": "[rad] angle between the telescope and the zone's axis",
     "zone_direction_B": "unit vector along (zone's axis - boresight), in body axes; zero where the two coincide",
     "q_e0_previous": "q_e0 one time step ago, with the sign that it had then; at the start, q_e0 itself",
+    "omega_BN_P": "[1/T] rate of the body relative to inertial, in the policy's axes",
+    "zone_direction_P": "unit vector along (zone's axis - boresight), in the policy's axes; zero where they coincide",
+    "inertia": "[J] entries xx, yy, zz, xy, xz, yz of the inertia in the policy's axes",
+    "reach": "[u] largest torque along each of the policy's axes",
+    "step": f"natural logarithm of the time step over {SHORTEST_STEP} T, at least 0",
+    "rate_limit": f"natural logarithm of the largest rate over {FREE_RATE} / T, at most 0: there is no limit",
+    "urgency": "from -1 (thrifty) to 1 (as fast as the torque allows)",
 }
 
 
 @functools.cache
-def layout(zones: int = 1) -> Mapping[str, int]:
-    """Names and sizes of the parts, in order, for a policy that sees so many zones."""
+def layout(zones: int = 1, scaled: bool = False) -> Mapping[str, int]:
+    """Names and sizes of the parts, in order, for a policy that sees so many zones.
+
+    scaled: for a policy for any spacecraft, see ``any_spacecraft.nondimensional``.
+    """
+    if scaled:
+        seen = {zone_part(number, name): size for number in range(zones) for name, size in _SCALED_ZONE.items()}
+        return MappingProxyType({"q_e": 4, "omega_BN_P": 3} | seen | _SPACECRAFT)
     first = {
         "q_e": 4,  # attitude relative to the target
         "omega_BN_B": 3,  # [rad/s]
@@ -63,19 +93,19 @@ def meaning(part: str) -> str:
     number, _, name = part.partition("_")
     if not number.isdigit():
         return _MEANING[part]
-    absent = "0" if name == "zone_direction_B" else "pi"
+    absent = "0" if name.startswith("zone_direction") else "pi"
     return f"the same of zone {number} in the order of the margins; {absent} where there is none"
 
 
-def size(zones: int = 1) -> int:
+def size(zones: int = 1, scaled: bool = False) -> int:
     """Entries of the observation."""
-    return sum(layout(zones).values())
+    return sum(layout(zones, scaled).values())
 
 
 @functools.cache
-def slices(zones: int = 1) -> Mapping[str, slice]:
+def slices(zones: int = 1, scaled: bool = False) -> Mapping[str, slice]:
     """Where each part is."""
-    parts = layout(zones)
+    parts = layout(zones, scaled)
     ends = itertools.accumulate(parts.values())
     return MappingProxyType({name: slice(end - parts[name], end) for name, end in zip(parts, ends, strict=True)})
 
@@ -86,15 +116,15 @@ SIZE = size()
 SLICES = slices()
 
 
-def as_observations(observations: npt.ArrayLike, zones: int = 1) -> np.ndarray:
-    """Check what a controller that sees so many zones is asked.  Returns float32 (size,) or (batch, size).
+def as_observations(observations: npt.ArrayLike, zones: int = 1, scaled: bool = False) -> np.ndarray:
+    """Check what a controller is asked, see ``layout``.  Returns float32 (size,) or (batch, size).
 
     Raises:
         SettingsError: they are no finite numbers, or have another shape.
 
     """
     observed = as_numbers("observations", observations)
-    allowed = size(zones)
+    allowed = size(zones, scaled)
     if observed.ndim not in (1, 2) or observed.shape[-1] != allowed:
         raise SettingsError(f"observations: must have shape ({allowed},) or (batch, {allowed}), got {observed.shape}")
     return observed

@@ -1,6 +1,6 @@
-"""What a maneuver is made of: the model that controllers and shield know, the truth that flies, and the state."""
+"""What a maneuver is made of: the model that controllers and shield know, the truth that flies, states and steps."""
 
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ from flax import struct
 from koz_jax.task import dynamics, rotations
 from koz_jax.task.actuators import Actuators, ActuatorState, TorqueLimits
 from koz_jax.task.dynamics import RigidBodyState
+from koz_jax.task.reward import Outcome, RewardTerms
 from koz_jax.task.scenario import Scenario
 
 Tree = TypeVar("Tree")
@@ -20,6 +21,7 @@ class Model(struct.PyTreeNode):
     inertia_B: jax.Array  # (3, 3) [kg m^2], symmetric positive definite, in body axes
     actuators: Actuators
     dt: jax.Array  # () [s] time step, over which the torque is held
+    max_rate: jax.Array | None = None  # () [rad/s] limit of the rate's norm; None where there is none
 
 
 class Truth(struct.PyTreeNode):
@@ -39,6 +41,48 @@ class EnvState(struct.PyTreeNode):
     torque_B: jax.Array  # (3,) [N m] applied in the last step
     steps: jax.Array  # () int32, steps since the reset
     actuators: ActuatorState = None
+
+
+class ActionFilter(Protocol):
+    """What stands between a controller and the actuators, such as the shield.  Implementations are pytrees."""
+
+    def covers(self, at: EnvState, model: Model) -> jax.Array:
+        """Whether what the filter guarantees holds from this state on.  Returns () bool."""
+        ...
+
+    def allow(self, measured: EnvState, action: jax.Array, model: Model) -> jax.Array:
+        """Action (3,) in [-1, 1] that is let through in place of the requested one (3,) in [-1, 1]."""
+        ...
+
+
+class Command(struct.PyTreeNode):
+    """What is asked of the actuators in a step, as shares of the torque limits."""
+
+    requested: jax.Array  # (3,) by the controller, clipped to [-1, 1]
+    applied: jax.Array  # (3,) after the filter
+
+    @property
+    def intervened(self) -> jax.Array:
+        """Whether the filter changed anything.  Returns () bool."""
+        return jnp.any(self.applied != self.requested)
+
+    @property
+    def change(self) -> jax.Array:
+        """What the filter changed.  Returns (3,)."""
+        return jax.lax.stop_gradient(self.applied - self.requested)
+
+
+class Step(struct.PyTreeNode):
+    """What one step gives.  The observation has 16 entries, 5 more for each zone above one that is observed."""
+
+    state: EnvState
+    observation: jax.Array  # (entries,) to act on next; of the next maneuver where ``step_autoreset`` has begun it
+    final_observation: jax.Array  # (entries,) that the step itself led to
+    command: Command
+    outcome: Outcome
+    terms: RewardTerms  # of the paper's reward, unweighted
+    terminated: jax.Array  # () bool, always false: neither settling nor a violation ends a maneuver
+    truncated: jax.Array  # () bool, the maneuver's time is up
 
 
 def begin(scenario: Scenario, model: Model) -> EnvState:

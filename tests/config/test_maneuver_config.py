@@ -12,8 +12,8 @@ import pytest
 from support.tiny import ROOT, merged
 
 from koz_jax.config import attitudes
-from koz_jax.config.maneuver import ManeuverConfig
-from koz_jax.config.maneuver_file import load_maneuver, load_spacecraft
+from koz_jax.config.maneuvers.maneuver import ManeuverConfig
+from koz_jax.config.maneuvers.maneuver_file import load_maneuver, load_spacecraft
 from koz_jax.config.shield import UncertaintyConfig
 from koz_jax.errors import SettingsError
 from koz_jax.task import rotations

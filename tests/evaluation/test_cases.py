@@ -12,6 +12,7 @@ from support import tiny
 from koz_jax.config import task
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.shield import ShieldConfig, UncertaintyConfig
+from koz_jax.config.spread import SpreadConfig
 from koz_jax.config.task import TaskConfig
 from koz_jax.control.registry import load_controller
 from koz_jax.control.shield.filter import Shield
@@ -244,3 +245,24 @@ def test_a_direction_that_is_not_of_unit_length_is_never_a_false_safe():
         other = crossing.replace(constraints=crossing.constraints.replace(axis_N=jnp.array([axis])))
         with pytest.raises(SettingsError, match=r"constraints\.axis_N\[0\]: must"):
             cases.fly_scenario(pd, other)
+
+
+ANY_SPACECRAFT = TaskConfig(episode_seconds=2.0, spread=SpreadConfig(spacecraft=True, step_shares=(0.02, 0.04)))
+
+
+@pytest.mark.parametrize("shield", [None, ShieldConfig()])
+def test_a_case_of_another_spacecraft_is_flown_again_with_that_spacecraft(shield):
+    config = MonteCarloConfig(cases=3, seed=SEED, shield=shield)
+    agent = load_controller("pd", ANY_SPACECRAFT)
+    all_of_them = cases.fly_cases(agent.controller, ANY_SPACECRAFT, config)
+    history, again = cases.fly_case(agent, 1, config)
+    assert_same_cases(jax.tree.map(lambda leaf: leaf[None], again), jax.tree.map(lambda leaf: leaf[1:2], all_of_them))
+    boresights_B = history.state.scenario.constraints.boresight_B
+    assert not np.allclose(boresights_B[0, 0], ANY_SPACECRAFT.spacecraft.boresight)
+
+
+def test_every_case_has_a_spacecraft_of_its_own_the_same_for_every_controller():
+    config = MonteCarloConfig(cases=4, seed=SEED)
+    drawn = [cases.draw_case(ANY_SPACECRAFT, config, case) for case in range(4)]
+    looks = {tuple(np.asarray(one.constraints.boresight_B[0]).tolist()) for one in drawn}
+    assert len(looks) == 4

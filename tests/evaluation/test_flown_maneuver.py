@@ -12,8 +12,8 @@ from support.tiny import ROOT, merged, untrained_agent
 
 import koz_jax
 from koz_jax.agents.flight import load_for
-from koz_jax.config.maneuver import ManeuverConfig
-from koz_jax.config.maneuver_file import load_maneuver
+from koz_jax.config.maneuvers.maneuver import ManeuverConfig
+from koz_jax.config.maneuvers.maneuver_file import load_maneuver
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.shield import ShieldConfig, UncertaintyConfig
 from koz_jax.control.registry import load_controller

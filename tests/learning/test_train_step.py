@@ -13,6 +13,7 @@ from scipy import stats
 from koz_jax.config.base import constant
 from koz_jax.config.curriculum import CurriculumConfig, PhaseConfig
 from koz_jax.config.presets import preset
+from koz_jax.config.spread import SpreadConfig
 from koz_jax.config.task import RewardConfig, ScenarioConfig, TaskConfig
 from koz_jax.config.training import NetworkConfig, SacConfig, TrainConfig
 from koz_jax.learning import curriculum, train_step
@@ -451,3 +452,27 @@ def test_the_curriculum_sets_the_deviations_and_nothing_else_of_the_environment(
         )
     )
     jax.tree.map(np.testing.assert_array_equal, same, env)
+
+
+def test_every_episode_has_a_spacecraft_of_its_own():
+    """Environments are drawn anew exactly where their episode ends, and each differently."""
+    spread = CONFIG.task.model_copy(update={"spread": SpreadConfig(spacecraft=True, urgency=(0.0, 1.0))})
+    network = CONFIG.network.model_copy(update={"scaled": True})
+    config = CONFIG.model_copy(update={"task": spread, "network": network, "training_episode_seconds": 2.0})
+    env = train_step.training_environment(config)
+    state = train_step.init(config, jax.random.key(0))
+    step = jax.jit(functools.partial(train_step.train_step, config, env))
+    drawn = jax.jit(functools.partial(train_step.environments_at, config, env))
+    changes = 0
+    for number in range(8):
+        now, then = (drawn(jnp.int32(config.prefill_steps + number + later)) for later in (0, 1))
+        state, _ = step(state)
+        ended = np.asarray(state.env_states.steps) == 0
+        for leaf in (lambda e: e.model.inertia_B, lambda e: e.ranges.boresight_B, lambda e: e.urgency):
+            changed = np.any((np.asarray(leaf(now)) != np.asarray(leaf(then))).reshape(config.num_envs, -1), axis=1)
+            np.testing.assert_array_equal(changed, ended)
+        changes += ended.sum()
+    assert changes > 0
+    assert len(np.unique(np.asarray(now.urgency))) == config.num_envs
+    # What a step is worth is the same for all: the time step is the task's.
+    np.testing.assert_allclose(now.model.dt, config.task.step_seconds, rtol=1e-5)

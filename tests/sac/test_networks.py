@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from koz_jax.sac.networks import Policy, SquashedGaussian, TwinCritic, encode
+from koz_jax.sac.networks import DIAL_FEATURES, Policy, SquashedGaussian, TwinCritic, dial_features, encode
 
 
 def log_prob_float64(mean, log_std, noise):
@@ -167,3 +167,29 @@ def test_critic_sees_observation_and_action(critic):
     gradient = jax.jit(jax.jacobian(network.apply, argnums=(1, 2)))(params, jnp.ones(4), 0.5 * jnp.ones(3))
     for part in gradient:
         assert np.all(np.abs(part) > 0.0)
+
+
+DIALS = ((3, -1.0, 1.0),)
+
+
+def test_dials_modulate_every_layer_and_begin_as_none():
+    """Weights of gains are zero at first: the layers then are those of a network that sees the features beside."""
+    policy = Policy((8, 8), (), 2, DIALS)
+    observed = jax.random.normal(jax.random.key(1), (5, 4))
+    params = policy.init(jax.random.key(0), observed)
+    gains = {name: leaf for name, leaf in params["params"]["Mlp_0"].items() if name.startswith("Gain")}
+    assert set(gains) == {"Gain_0", "Gain_1"}
+    assert all(not np.any(leaf["kernel"]) for leaf in gains.values())
+    before = policy.apply(params, observed).mean
+    opened = jax.tree_util.tree_map_with_path(lambda path, leaf: leaf + 0.3 if "Gain" in str(path) else leaf, params)
+    assert not np.allclose(before, policy.apply(opened, observed).mean)
+
+
+def test_features_of_a_dial_are_bells_over_its_range():
+    observed = jnp.array([[0.0, 0.0, 0.0, -1.0], [0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    features = np.asarray(dial_features(observed, DIALS))
+    assert features.shape == (3, DIAL_FEATURES)
+    np.testing.assert_array_equal(features.argmax(axis=1), [0, 2, 4])
+    np.testing.assert_allclose(features.max(axis=1), 1.0)
+    np.testing.assert_allclose(features[0, 1], np.exp(-0.5), rtol=1e-6)
+    assert dial_features(observed, ()).shape == (3, 0)

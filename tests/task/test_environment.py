@@ -12,10 +12,10 @@ from koz_jax.errors import SettingsError
 from koz_jax.task import environment, reward, scenario
 from koz_jax.task.actuators import TorqueBox
 from koz_jax.task.dynamics import RigidBodyState
-from koz_jax.task.environment import Reorientation, Step
+from koz_jax.task.environment import Reorientation
 from koz_jax.task.pointing_constraints import PointingConstraint
 from koz_jax.task.scenario import SamplingRule, Scenario
-from koz_jax.task.state import EnvState, Model, Truth
+from koz_jax.task.state import EnvState, Model, Step, Truth
 
 STEPS = 200
 SAMPLES = 3
@@ -495,7 +495,7 @@ def test_autoreset_brings_fresh_scenarios_of_the_range_for_ever(short):
 
 def test_the_model_has_nothing_of_the_truth():
     """What is uncertain is in ``Truth`` alone: whoever is given a ``Model`` cannot be told a disturbance."""
-    assert set(Model.__dataclass_fields__) == {"inertia_B", "actuators", "dt"}
+    assert set(Model.__dataclass_fields__) == {"inertia_B", "actuators", "dt", "max_rate"}
     assert set(Truth.__dataclass_fields__) == {"inertia_B", "disturbance_B"}
 
 

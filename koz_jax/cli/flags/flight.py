@@ -15,8 +15,10 @@ from koz_jax.cli.flags.parsing import ChangesOf, agents_own, same_as
 from koz_jax.config.base import MarginDeg, NonNegativeFloat, Settings, ZoneCount
 from koz_jax.config.monte_carlo import CaseConfig, MonteCarloConfig
 from koz_jax.config.shield import CERTAIN, ShieldConfig, UncertaintyConfig
+from koz_jax.config.spread import Urgency
 from koz_jax.config.task import ScenarioConfig, TaskConfig
 from koz_jax.control.registry import ADVERSARIAL, CLASSICAL
+from koz_jax.errors import SettingsError
 
 if TYPE_CHECKING:
     from koz_jax.control.base import TaskController
@@ -39,19 +41,26 @@ class AgentFlags(Settings):
     controller: str | None = Field(
         default=None, description=f"Fly this on the agent's task in place of the agent: {CONTROLLERS}."
     )
+    urgency: Urgency | None = None
+    """How much an agent hurries that listens to it, from 0 (thrifty) to 1 (as fast as the torque allows); by default
+    0.5."""
 
     def load(self) -> TaskController:
         """Load who flies.
 
         Raises:
-            SettingsError: there is no such agent or controller.
+            SettingsError: there is no such agent or controller, or it does not listen to the urgency.
 
         """
         from koz_jax.agents.agent import load_agent
         from koz_jax.control.registry import load_controller
 
         agent = load_agent(self.agent)
-        return agent if self.controller is None else load_controller(self.controller, agent.task)
+        if self.controller is not None:
+            if self.urgency is not None:
+                raise SettingsError(f"urgency: is of agents, and {self.controller} has none; got {self.urgency}")
+            return load_controller(self.controller, agent.task)
+        return agent if self.urgency is None else agent.with_urgency(self.urgency)
 
 
 class _RuleFlags(Settings):
@@ -117,7 +126,16 @@ class FlightFlags(UncertaintyConfig, _RuleFlags, CaseConfig):
             SettingsError: a change is not allowed, or the shield has no torque for what it is to withstand.
 
         """
-        changed = parsing.applied("task", agent.task, self.task_changes)
+        return self.changed(agent.task)
+
+    def changed(self, task: TaskConfig) -> TaskConfig:
+        """A task with the changes that the flags ask for.
+
+        Raises:
+            SettingsError: as of ``task``.
+
+        """
+        changed = parsing.applied("task", task, self.task_changes)
         task = changed.with_rules(self.angle_convention, self.infeasible_zone, self.zones, self.max_rate_deg)
         if self.shield_config is not None:
             self.shield_config.check(task.spacecraft.torque_limits)

@@ -10,8 +10,8 @@ import tyro
 from pydantic import model_validator
 
 from koz_jax.cli.flags.flight import FlightFlags
-from koz_jax.config.maneuver import ManeuverConfig
-from koz_jax.config.maneuver_file import load_maneuver
+from koz_jax.config.maneuvers.maneuver import ManeuverConfig
+from koz_jax.config.maneuvers.maneuver_file import load_maneuver
 from koz_jax.config.monte_carlo import CaseConfig, MonteCarloConfig
 from koz_jax.config.shield import CERTAIN, UncertaintyConfig
 

@@ -9,8 +9,8 @@ import tyro
 from pydantic import ValidationError, model_validator
 
 from koz_jax.config.base import Settings
-from koz_jax.config.maneuver import ManeuverConfig
-from koz_jax.config.maneuver_file import load_spacecraft
+from koz_jax.config.maneuvers.maneuver import ManeuverConfig
+from koz_jax.config.maneuvers.maneuver_file import load_spacecraft
 from koz_jax.config.task import TaskConfig
 from koz_jax.errors import explain
 

@@ -1,6 +1,6 @@
 """Settings of one maneuver as a person writes it: spacecraft, instruments, constraints, start and target.
 
-Angles in degrees, quaternions scalar first; imports no jax.  ``config.maneuver_file`` reads such settings from TOML.
+Angles in degrees, quaternions scalar first; imports no jax.  ``maneuver_file`` reads such settings from TOML.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pydantic import model_validator
 
 from koz_jax.config import attitudes
 from koz_jax.config.base import PositiveFloat, check_steps
-from koz_jax.config.maneuver_tables import (
+from koz_jax.config.maneuvers.maneuver_tables import (
     BodyConfig,
     ConstraintConfig,
     ErrorsConfig,

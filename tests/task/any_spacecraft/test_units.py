@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from koz_jax.config.task import SpacecraftConfig, TaskConfig
-from koz_jax.task import dynamics, rotations, units
+from koz_jax.task import dynamics, rotations
+from koz_jax.task.any_spacecraft import units
 from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.environment import model_from_config
 
@@ -15,7 +16,8 @@ _DIRECTIONS = jax.vmap(rotations.normalize)(jax.random.normal(jax.random.key(5),
 
 @pytest.mark.parametrize(("inertia", "torque_limit"), [(60.0, 2.0), (0.004, 1e-3), (5e4, (10.0, 20.0, 5.0))])
 def test_the_strength_turns_half_a_radian_in_the_unit_of_time(inertia, torque_limit):
-    body = SpacecraftConfig(inertia=tuple(map(tuple, (inertia * np.eye(3)).tolist())), torque_limit=torque_limit)
+    sphere = ((inertia, 0.0, 0.0), (0.0, inertia, 0.0), (0.0, 0.0, inertia))
+    body = SpacecraftConfig(inertia=sphere, torque_limit=torque_limit)
     model = model_from_config(TaskConfig(spacecraft=body))
     own = units.of(model)
     start = RigidBodyState(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3))

@@ -10,8 +10,9 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from koz_jax.config.base import PositiveFloat
-from koz_jax.config.maneuver import ManeuverConfig
-from koz_jax.config.maneuver_tables import BodyConfig, InstrumentConfig, Table
+from koz_jax.config.maneuvers.maneuver import ManeuverConfig
+from koz_jax.config.maneuvers.maneuver_tables import BodyConfig, InstrumentConfig, Table
+from koz_jax.config.task import TaskConfig
 from koz_jax.errors import SettingsError, explain
 
 _log = logging.getLogger(__name__)
@@ -34,6 +35,21 @@ class SpacecraftFile(Table):
     """What turns."""
     instruments: tuple[InstrumentConfig, ...] = ()
     """What looks; constraints that name none are for the first."""
+
+    @property
+    def task(self) -> TaskConfig:
+        """The paper's draw of maneuvers for the first instrument, its times and rates in units of this spacecraft."""
+        paper = TaskConfig()
+        boresight = self.instruments[0].boresight if self.instruments else paper.spacecraft.boresight
+        body = self.spacecraft.spacecraft(boresight)
+        stretch = body.time_unit / paper.spacecraft.time_unit
+        return TaskConfig(
+            spacecraft=body,
+            reward=paper.reward.model_copy(update={"settled_angle_deg": self.settled_angle_deg}),
+            scenario=paper.scenario.model_copy(update={"max_rate_deg": paper.scenario.max_rate_deg / stretch}),
+            step_seconds=self.step_seconds,
+            episode_seconds=paper.episode_seconds * stretch,
+        )
 
 
 def load_maneuver(path: Path | str) -> ManeuverConfig:

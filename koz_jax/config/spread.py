@@ -1,0 +1,38 @@
+"""Settings of what maneuvers of one task differ in besides their scenario.  Angles in degrees; imports no jax."""
+
+from __future__ import annotations
+
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from koz_jax.config.base import PositiveFloat, Settings
+
+Urgency = Annotated[float, Field(ge=0, le=1)]
+
+
+class SpreadConfig(Settings):
+    """What is drawn anew for every maneuver, besides its scenario."""
+
+    spacecraft: bool = False
+    """Fly another spacecraft in every maneuver: any shape, any instrument, torque limits that differ by up to a factor
+    of 2; the trace of the inertia and the strength of the actuators are the task's."""
+    step_shares: tuple[PositiveFloat, PositiveFloat] = (0.009, 0.05)
+    """Time steps of these spacecraft, in units of T = sqrt(J / u)."""
+    max_rate_deg: tuple[PositiveFloat, PositiveFloat] | None = None
+    """Limits of the body rate [deg/s], distributed evenly over their logarithm; None leaves the spacecraft's own."""
+    urgency: tuple[Urgency, Urgency] | None = None
+    """Urgencies that an agent is trained with; None leaves 0.5."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        for name in ("step_shares", "max_rate_deg", "urgency"):
+            limits = getattr(self, name)
+            if limits is not None and limits[0] > limits[1]:
+                raise ValueError(f"{name} must be in order; got {limits}")
+        return self
+
+    @property
+    def is_none(self) -> bool:
+        """Whether nothing is drawn."""
+        return not self.spacecraft and self.max_rate_deg is None and self.urgency is None

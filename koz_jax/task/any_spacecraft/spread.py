@@ -1,0 +1,82 @@
+"""What is drawn anew for every maneuver besides its scenario: the spacecraft, its rate limit, the urgency."""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from koz_jax.config.spread import SpreadConfig
+from koz_jax.config.task import TaskConfig
+from koz_jax.task import rotations
+from koz_jax.task.actuators import TorqueBox
+from koz_jax.task.any_spacecraft import units
+from koz_jax.task.state import Model
+
+# Smallest second moment of a body of unit largest one: no body is thinner.
+_THINNEST = 0.05
+
+# Torque limits of the axes differ by at most this factor.
+_UNEQUAL = 2.0
+
+
+class Spread(struct.PyTreeNode):
+    """How far maneuvers differ; traced but for whether spacecraft do."""
+
+    step_shares: jax.Array  # (2,) [T] shortest and longest time step
+    max_rates: jax.Array  # (2,) [rad/s]
+    urgencies: jax.Array  # (2,)
+    spacecraft: bool = struct.field(pytree_node=False)
+    rate_limits: bool = struct.field(pytree_node=False)
+
+
+class Drawn(struct.PyTreeNode):
+    """What is drawn for one maneuver."""
+
+    model: Model
+    boresight_B: jax.Array  # (3,) unit vector of the instrument
+    urgency: jax.Array  # ()
+
+
+def draw(spread: Spread, model: Model, boresight_B: jax.Array, key: jax.Array) -> Drawn:
+    """Draw for one maneuver; what is not spread is as given.  key: () typed PRNG key."""
+    key_body, key_boresight, key_rate, key_urgency = jax.random.split(key, 4)
+    if spread.spacecraft:
+        model = _sample_body(spread, model, key_body)
+        boresight_B = rotations.normalize(jax.random.normal(key_boresight, (3,)))
+    if spread.rate_limits:
+        low, high = jnp.log(spread.max_rates)
+        model = model.replace(max_rate=jnp.exp(jax.random.uniform(key_rate, (), minval=low, maxval=high)))
+    low, high = spread.urgencies
+    return Drawn(model, boresight_B, jax.random.uniform(key_urgency, (), minval=low, maxval=high))
+
+
+def _sample_body(spread: Spread, model: Model, key: jax.Array) -> Model:
+    """Draw a body: its second moments, how it is turned, its torque limits and its time step.
+
+    Second moments of mass along three axes make every inertia that a body can have: each principal moment is the sum
+    of the other two's.
+    """
+    key_shape, key_turn, key_torque, key_step = jax.random.split(key, 4)
+    own = units.of(model)
+    second = jax.random.uniform(key_shape, (3,), minval=_THINNEST, maxval=1.0)
+    moments = 1.5 * own.inertia * (1.0 - second / jnp.sum(second))
+    turn = rotations.normalize(jax.random.normal(key_turn, (4,)))
+    axes = jax.vmap(rotations.rotate, in_axes=(None, 0))(turn, jnp.eye(3))
+    limits = _UNEQUAL ** jax.random.uniform(key_torque, (3,), minval=-0.5, maxval=0.5)
+    limits = own.torque * limits / jnp.sqrt(jnp.mean(limits**2))
+    low, high = spread.step_shares
+    share = jax.random.uniform(key_step, (), minval=low, maxval=high)
+    return model.replace(inertia_B=axes.T @ (moments[:, None] * axes), actuators=TorqueBox(limits), dt=share * own.time)
+
+
+def from_config(task: TaskConfig) -> Spread | None:
+    """What a task spreads, traced; None where it spreads nothing."""
+    config: SpreadConfig = task.spread
+    if config.is_none:
+        return None
+    return Spread(
+        step_shares=jnp.array(config.step_shares),
+        max_rates=jnp.deg2rad(jnp.array(config.max_rate_deg or (1.0, 1.0))),
+        urgencies=jnp.array(config.urgency or (0.5, 0.5)),
+        spacecraft=config.spacecraft,
+        rate_limits=config.max_rate_deg is not None,
+    )
