@@ -1,4 +1,7 @@
-"""Controllers that do their worst, to try the shield: none of them knows what is good for the telescope."""
+"""Controllers that do their worst, to try the shield: none of them knows what is good for the telescope.
+
+Times are in units of T, see ``any_spacecraft.units``.
+"""
 
 from typing import Any
 
@@ -9,7 +12,11 @@ from flax import struct
 from koz_jax.control import registry
 from koz_jax.control.base import Memoryless
 from koz_jax.task import dynamics, pointing_constraints, rotations
+from koz_jax.task.any_spacecraft import units
 from koz_jax.task.state import EnvState, Model, torque_limits
+
+# [T/rad] How much a rate that does not lead to the zone weighs with the adversary, beside the way that does.
+_ASIDE = 1.825742
 
 
 class _Drawn(struct.PyTreeNode):
@@ -33,9 +40,9 @@ class Random(struct.PyTreeNode):
 
 
 class BangBang(struct.PyTreeNode):
-    """Full throttle: a random corner of the torque box, held for some seconds at a time."""
+    """Full throttle: a random corner of the torque box, held for some time."""
 
-    hold: jax.Array = struct.field(default_factory=lambda: jnp.float32(4.0))  # () [s]
+    hold: jax.Array = struct.field(default_factory=lambda: jnp.float32(0.7302967))  # () [T]
 
     def begin(self, state: EnvState, model: Model, key: jax.Array) -> _Drawn:
         """Draw the first corner."""
@@ -43,7 +50,7 @@ class BangBang(struct.PyTreeNode):
 
     def decide(self, state: EnvState, model: Model, memory: _Drawn) -> tuple[jax.Array, _Drawn]:
         """Action (3,): the corner that is held."""
-        steps = jnp.maximum(jnp.round(self.hold / model.dt).astype(jnp.int32), 1)
+        steps = jnp.maximum(_steps(self.hold, model), 1)
         again = (state.steps % steps == 0) & (state.steps > 0)
         fresh = self._draw(memory.key)
         memory = jax.tree.map(lambda new, old: jnp.where(again, new, old), fresh, memory)
@@ -60,20 +67,19 @@ class Adversary(Memoryless):
 
     def decide(self, state: EnvState, model: Model, memory: None) -> tuple[jax.Array, None]:
         """Action (3,) at the edge of the box."""
-        return _full(_towards_zone(state) - _aside(state), state, model), memory
+        return _full(_towards_zone(state) - _aside(state, model), state, model), memory
 
 
 class SpinUp(Memoryless):
-    """Builds up rate for some seconds about an axis of the body, then steers into the zone."""
+    """Builds up rate for some time about an axis of the body, then steers into the zone."""
 
-    spin_seconds: jax.Array = struct.field(default_factory=lambda: jnp.float32(20.0))  # () [s]
+    spin_time: jax.Array = struct.field(default_factory=lambda: jnp.float32(3.651484))  # () [T]
     axis_B: jax.Array = struct.field(default_factory=lambda: jnp.array([1.0, 1.0, 1.0]))  # (3,) spun up about
 
     def decide(self, state: EnvState, model: Model, memory: None) -> tuple[jax.Array, None]:
         """Action (3,)."""
-        seconds = state.steps * model.dt
         steer = _full(_towards_zone(state), state, model)
-        return jnp.where(seconds < self.spin_seconds, self.axis_B, steer), memory
+        return jnp.where(state.steps < _steps(self.spin_time, model), self.axis_B, steer), memory
 
 
 class AnyAdversary(struct.PyTreeNode):
@@ -105,16 +111,20 @@ def _towards_zone(state: EnvState) -> jax.Array:
     return turn_B / jnp.maximum(rotations.norm(turn_B), 1e-6)
 
 
-def _aside(state: EnvState) -> jax.Array:
-    """Part of the rate (3,) [rad/s] that does not lead to the zone, weighed so that it is damped in seconds."""
+def _steps(time: jax.Array, model: Model) -> jax.Array:
+    """Steps () int32 in a time () [T]."""
+    return jnp.round(time * units.of(model).time / model.dt).astype(jnp.int32)
+
+
+def _aside(state: EnvState, model: Model) -> jax.Array:
+    """Part of the rate that does not lead to the zone, (3,) beside the unit vector that does."""
     towards_B = _towards_zone(state)
     omega_B = state.body.omega_BN_B
-    return 10.0 * (omega_B - rotations.dot(omega_B, towards_B) * towards_B)
+    return _ASIDE * units.of(model).time * (omega_B - rotations.dot(omega_B, towards_B) * towards_B)
 
 
 def _full(acceleration_B: jax.Array, state: EnvState, model: Model) -> jax.Array:
     """Largest action (3,) within the box that accelerates along a body axis (3,)."""
-    torque_B = dynamics.matvec(model.inertia_B, acceleration_B)
     limits = torque_limits(state, model)
-    shares = torque_B / (limits.box_B / limits.scale)
+    shares = dynamics.matvec(model.inertia_B, acceleration_B) / (units.of(model).inertia * limits.box_B / limits.scale)
     return shares / jnp.maximum(jnp.max(jnp.abs(shares)), 1e-9)
