@@ -55,9 +55,9 @@ class Timing(struct.PyTreeNode):
         pieces = self.time.shape[0] - 1
         now = jnp.clip(time, 0.0, self.duration)
         i = jnp.clip(jnp.searchsorted(self.time, now, side="right") - 1, 0, pieces - 1)
-        length = jnp.maximum(self.time[i + 1] - self.time[i], 1e-9)
+        length = self.time[i + 1] - self.time[i]
         passed = now - self.time[i]
-        acceleration = (self.speed[i + 1] - self.speed[i]) / length
+        acceleration = (self.speed[i + 1] - self.speed[i]) / jnp.where(length > 0.0, length, 1.0)
         s = i / pieces + (self.speed[i] + 0.5 * acceleration * passed) * passed
         speed = self.speed[i] + acceleration * passed
         arrived = time >= self.duration
@@ -91,6 +91,9 @@ def clearance(samples: Samples, zones: PointingConstraint) -> jax.Array:
 
 def fastest_timing(samples: Samples, inertia_B: jax.Array, limit_B: jax.Array) -> Timing:
     """Time a path as fast as a torque of at most ``limit_B`` (3,) [N m] about each body axis allows."""
+    # In units in which numbers are of order one, so that the least of them, below, suit every spacecraft.
+    inertia, torque = jnp.trace(inertia_B) / 3.0, jnp.sqrt(jnp.mean(limit_B**2))
+    inertia_B, limit_B, unit = inertia_B / inertia, limit_B / torque, jnp.sqrt(inertia / torque)
     pieces = samples.slope_B.shape[0] - 1
     step = 1.0 / pieces
     middle_B = 0.5 * (samples.slope_B[1:] + samples.slope_B[:-1])
@@ -118,7 +121,7 @@ def fastest_timing(samples: Samples, inertia_B: jax.Array, limit_B: jax.Array) -
     _, ends = jax.lax.scan(fastest_end, jnp.zeros(()), (ahead, back, limits))
     speed = jnp.sqrt(jnp.concatenate([jnp.zeros(1), ends]))
     times = 2.0 * step / jnp.maximum(speed[1:] + speed[:-1], 1e-6)
-    return Timing(speed, jnp.concatenate([jnp.zeros(1), jnp.cumsum(times)]))
+    return Timing(speed / unit, unit * jnp.concatenate([jnp.zeros(1), jnp.cumsum(times)]))
 
 
 def _largest_begin(ahead: jax.Array, back: jax.Array, most: jax.Array) -> jax.Array:

@@ -17,11 +17,12 @@ from koz_jax.control import attitude_path, feedback
 from koz_jax.control.attitude_path import AttitudePath, Timing
 from koz_jax.control.feedback import Gain
 from koz_jax.task import rotations
+from koz_jax.task.any_spacecraft import units
 from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.state import EnvState, Model, torque_limits
 
-# What a path too close to a zone costs; more than any detour.
-_SECONDS_PER_SHORTFALL = 2000.0
+# What a path too close to a zone costs [T/rad]; more than any detour.
+_TIME_PER_SHORTFALL = 365.1484
 
 # Bends that are tried first [deg], and to how many sides.
 _BENDS_DEG = (30.0, 50.0, 80.0, 120.0)
@@ -75,11 +76,12 @@ class PathPlanner(struct.PyTreeNode):
     The tracking error decays with ``bandwidth``, its rate with ``rate_bandwidth``.
     """
 
-    # ``python -m koz_jax.cli.tune planner --cases 100 --candidates 16 --rounds 6`` at commit 00b415c.
+    # ``python -m koz_jax.cli.tune planner --cases 100 --candidates 16 --rounds 6`` at commit 00b415c, which found
+    # 0.2939 and 3.296 1/s for T = sqrt(30) s.
     margin: Gain = 0.0472  # () [rad] that the path keeps from the zones
     torque_share: Gain = 0.9932  # () of the torque limit that the path needs at most
-    bandwidth: Gain = 0.2939  # () [1/s]
-    rate_bandwidth: Gain = 3.296  # () [1/s]
+    bandwidth: Gain = 1.609757  # () [1/T]
+    rate_bandwidth: Gain = 18.05294  # () [1/T]
     patience: Gain = 0.0425  # () [rad] tracking error at which the plan waits
     sines: int = struct.field(pytree_node=False, default=2)  # of the bend
     points: int = struct.field(pytree_node=False, default=49)  # of a path
@@ -95,8 +97,9 @@ class PathPlanner(struct.PyTreeNode):
             samples = attitude_path.sample(path, self.points)
             clear = attitude_path.clearance(samples, state.scenario.constraints)
             timing = attitude_path.fastest_timing(samples, model.inertia_B, limit_B)
-            return timing.duration + _SECONDS_PER_SHORTFALL * jnp.maximum(self.margin - clear, 0.0)
+            return timing.duration + per_shortfall * jnp.maximum(self.margin - clear, 0.0)
 
+        per_shortfall = _TIME_PER_SHORTFALL * units.of(model).time
         limit_B = self.torque_share * torque_limits(state, model).box_B
         bends_B = self._search(cost, self._first_bends(state), key_search)
         path = attitude_path.from_state(state.body, state.scenario.q_DN, bends_B)
@@ -143,9 +146,10 @@ class PathPlanner(struct.PyTreeNode):
         error_B = plan.error(body)
         pace = jnp.clip(2.0 - rotations.norm(error_B) / self.patience, 0.0, 1.0)
         now, soon = plan.reference(plan.clock, pace), plan.reference(plan.clock + pace * dt, pace)
-        wanted_B = now.omega_BN_B - self.bandwidth * error_B
-        change_B = (soon.omega_BN_B - now.omega_BN_B) / dt - self.bandwidth * (body.omega_BN_B - now.omega_BN_B)
-        acceleration_B = change_B + self.rate_bandwidth * (wanted_B - body.omega_BN_B)
+        bandwidth, rate_bandwidth = (feedback.bandwidth(gain, model) for gain in (self.bandwidth, self.rate_bandwidth))
+        wanted_B = now.omega_BN_B - bandwidth * error_B
+        change_B = (soon.omega_BN_B - now.omega_BN_B) / dt - bandwidth * (body.omega_BN_B - now.omega_BN_B)
+        acceleration_B = change_B + rate_bandwidth * (wanted_B - body.omega_BN_B)
         middle = body.replace(omega_BN_B=body.omega_BN_B + 0.5 * dt * change_B)
         action = feedback.action(acceleration_B, middle, model.inertia_B, torque_limits(state, model))
         return action, plan.replace(clock=plan.clock + pace * dt)

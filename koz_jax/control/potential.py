@@ -14,11 +14,16 @@ from koz_jax.control import feedback
 from koz_jax.control.base import Memoryless
 from koz_jax.control.feedback import Gain
 from koz_jax.task import rotations
+from koz_jax.task.any_spacecraft import units
 from koz_jax.task.pointing_constraints import PointingConstraint
 from koz_jax.task.state import EnvState, Model, attitude_error, torque_limits
 
 # Below this the barrier goes on as a straight line, so that it is finite inside a zone too.
 _LEAST_ROOM = 1e-3
+
+# Share of the rate that damping takes back within a time step, at most: all of it; with more than twice that a held
+# torque would be unstable.  It is 0.992 on the paper's task.
+_DAMPING_PER_STEP = 1.0
 
 
 class Potential(struct.PyTreeNode):
@@ -61,11 +66,11 @@ class PotentialFeedback(Memoryless):
     """Torque along minus the gradient of the potential, with damping.
 
     Gains are those of the error's linear dynamics near the target far from zones: a natural frequency and a damping
-    ratio.
+    ratio.  Both are lower where damping would be too strong for the time step.
     """
 
-    # ``python -m koz_jax.cli.tune potential`` at commit 00b415c.
-    frequency: Gain = 1.149  # () [rad/s]
+    # ``python -m koz_jax.cli.tune potential`` at commit 00b415c, which found 1.149 rad/s for T = sqrt(30) s.
+    frequency: Gain = 6.293332  # () [rad/T]
     damping: Gain = 4.316  # () ratio
     barrier: Gain = 0.3762  # ()
     margin: Gain = 0.02756  # () [rad]
@@ -73,7 +78,11 @@ class PotentialFeedback(Memoryless):
     def decide(self, state: EnvState, model: Model, memory: None) -> tuple[jax.Array, None]:
         """Action (3,)."""
         gradient_B = Potential(self.barrier, self.margin).gradient(state)
+        frequency = self.frequency / units.of(model).time
+        damping = 2.0 * self.damping * frequency
         # Near the target |q_e - 1|^2 is a quarter of the error squared, and its gradient half the error.
-        spring_B = -2.0 * self.frequency**2 * gradient_B
-        damping_B = -2.0 * self.damping * self.frequency * state.body.omega_BN_B
-        return feedback.action(spring_B + damping_B, state.body, model.inertia_B, torque_limits(state, model)), memory
+        spring_B = -2.0 * frequency**2 * gradient_B
+        # Of both alike, so that the rate at which they balance stays, which is how fast the body goes about.
+        share = jnp.minimum(_DAMPING_PER_STEP / (damping * model.dt), 1.0)
+        acceleration_B = share * (spring_B - damping * state.body.omega_BN_B)
+        return feedback.action(acceleration_B, state.body, model.inertia_B, torque_limits(state, model)), memory

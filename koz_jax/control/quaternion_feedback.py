@@ -21,15 +21,16 @@ class QuaternionFeedback(Memoryless):
     Without saturation the error decays with ``bandwidth`` and the rate follows with ``rate_bandwidth``.
     """
 
-    # ``python -m koz_jax.cli.tune pd`` at commit 00b415c.
-    bandwidth: Gain = 5.86  # () [1/s]
-    rate_bandwidth: Gain = 0.4071  # () [1/s]
+    # ``python -m koz_jax.cli.tune pd`` at commit 00b415c, which found 5.86 and 0.4071 1/s for T = sqrt(30) s.
+    bandwidth: Gain = 32.09654  # () [1/T]
+    rate_bandwidth: Gain = 2.229779  # () [1/T]
     torque_share: Gain = 1.066  # () of the torque limit that braking counts on
 
     def decide(self, state: EnvState, model: Model, memory: None) -> tuple[jax.Array, None]:
         """Action (3,)."""
         q_e, omega_B = attitude_error(state), state.body.omega_BN_B
         limits = torque_limits(state, model)
+        bandwidth, rate_bandwidth = (feedback.bandwidth(gain, model) for gain in (self.bandwidth, self.rate_bandwidth))
 
         def wanted_rate(at: jax.Array) -> jax.Array:
             error_B = feedback.rotation_vector(at)
@@ -39,8 +40,8 @@ class QuaternionFeedback(Memoryless):
             brake = feedback.deceleration_about(
                 axis_B, jax.lax.stop_gradient(rate), model.inertia_B, limits, self.torque_share
             )
-            return -feedback.brake_rate(angle, jax.lax.stop_gradient(brake), self.bandwidth) * axis_B
+            return -feedback.brake_rate(angle, jax.lax.stop_gradient(brake), bandwidth) * axis_B
 
         wanted_B, change_B = jax.jvp(wanted_rate, (q_e,), (dynamics.attitude_rate(q_e, omega_B),))
-        acceleration_B = change_B + self.rate_bandwidth * (wanted_B - omega_B)
+        acceleration_B = change_B + rate_bandwidth * (wanted_B - omega_B)
         return feedback.action(acceleration_B, state.body, model.inertia_B, limits), memory

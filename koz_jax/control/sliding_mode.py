@@ -13,6 +13,7 @@ from koz_jax.control.base import Memoryless
 from koz_jax.control.feedback import Gain
 from koz_jax.control.potential import Potential
 from koz_jax.task import dynamics, pointing_constraints, rotations
+from koz_jax.task.any_spacecraft import units
 from koz_jax.task.pointing_constraints import PointingConstraint
 from koz_jax.task.state import EnvState, Model, attitude_error, torque_limits
 
@@ -20,10 +21,11 @@ from koz_jax.task.state import EnvState, Model, attitude_error, torque_limits
 class PotentialSliding(Memoryless):
     """Reaches the surface with a limited switching term, and slides along it to the target."""
 
-    # ``python -m koz_jax.cli.tune sliding`` at commit 00b415c.
-    bandwidth: Gain = 5.753  # () [1/s] with which the error decays near the target
-    reach: Gain = 0.4328  # () [1/s], eta / eps: how fast s decays inside the boundary layer
-    layer: Gain = 0.1371  # () [rad/s], eps
+    # ``python -m koz_jax.cli.tune sliding`` at commit 00b415c, which found 5.753 1/s, 0.4328 1/s and 0.1371 rad/s for
+    # T = sqrt(30) s.
+    bandwidth: Gain = 31.51048  # () [1/T] with which the error decays near the target
+    reach: Gain = 2.370543  # () [1/T], eta / eps: how fast s decays inside the boundary layer
+    layer: Gain = 0.7509276  # () [rad/T], eps
     torque_share: Gain = 0.8932  # () of the torque limit that braking counts on
     detour_share: Gain = 0.2404  # () of the rate that is kept where the way leads aside
     barrier: Gain = 0.03003  # () weight of a zone in the potential
@@ -40,10 +42,10 @@ class PotentialSliding(Memoryless):
         wanted_B, change_B = jax.jvp(wanted_rate, (body.q_BN,), (dynamics.attitude_rate(body.q_BN, body.omega_BN_B),))
         s_B = body.omega_BN_B - wanted_B
         size = rotations.norm(s_B)
-        switching_B = s_B * jnp.minimum(1.0, self.layer / jnp.where(size > 0.0, size, 1.0))
-        return feedback.action(
-            change_B - self.reach * switching_B, body, model.inertia_B, torque_limits(state, model)
-        ), memory
+        layer = self.layer / units.of(model).time
+        switching_B = s_B * jnp.minimum(1.0, layer / jnp.where(size > 0.0, size, 1.0))
+        acceleration_B = change_B - feedback.bandwidth(self.reach, model) * switching_B
+        return feedback.action(acceleration_B, body, model.inertia_B, torque_limits(state, model)), memory
 
     def wanted_rate(self, state: EnvState, model: Model) -> jax.Array:
         """v, the body rate (3,) [rad/s] on the surface."""
@@ -57,7 +59,8 @@ class PotentialSliding(Memoryless):
         )
         straight = jnp.maximum(rotations.dot(way_B, home_B), 0.0)
         share = self.detour_share + (1.0 - self.detour_share) * straight
-        return share * feedback.brake_rate(angle, jax.lax.stop_gradient(deceleration), self.bandwidth) * way_B
+        bandwidth = feedback.bandwidth(self.bandwidth, model)
+        return share * feedback.brake_rate(angle, jax.lax.stop_gradient(deceleration), bandwidth) * way_B
 
     def _around(self, state: EnvState) -> jax.Array:
         """Turn (3,) [1/rad] that leads the boresight around the zones between it and its target."""

@@ -17,7 +17,7 @@ def test_tuning_finds_what_was_spoilt():
     asked = checked(tune.TuneFlags, name="pd", cases=8, candidates=8, rounds=3)
     spoilt = dataclasses.replace(
         registry.load_controller("pd", TaskConfig(episode_seconds=20.0)),
-        controller=QuaternionFeedback(bandwidth=0.05, torque_share=0.1),
+        controller=QuaternionFeedback(bandwidth=0.3, torque_share=0.1),
     )
     scores = [score for _, score in tune.search(spoilt, asked)]
     assert scores == sorted(scores)

@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 from support.states import LOOK, MODEL, actions, random_states
 
 from koz_jax.control.potential import Potential, PotentialFeedback
+from koz_jax.task.any_spacecraft import units
 from koz_jax.task.pointing_constraints import smallest_margin
 from koz_jax.task.state import attitude_error
 
@@ -29,7 +30,8 @@ def potential_value(vector_B, state, potential, look_B):
 
 
 def test_potential_torque_is_minus_the_gradient_and_damping():
-    controller = PotentialFeedback(frequency=0.02)
+    controller = PotentialFeedback(frequency=0.11)
+    frequency = float(controller.frequency / units.of(MODEL).time)
     potential = Potential(controller.barrier, controller.margin)
     states = random_states(96, 31, rate=0.01)
     found = 2.0 * actions(controller, states)
@@ -46,8 +48,8 @@ def test_potential_torque_is_minus_the_gradient_and_damping():
             for way in ways
         ]
         omega_B = np.asarray(state.body.omega_BN_B, float)
-        acceleration_B = -2 * controller.frequency**2 * np.array(gradient_B)
-        acceleration_B -= 2 * controller.damping * controller.frequency * omega_B
+        acceleration_B = -2 * frequency**2 * np.array(gradient_B)
+        acceleration_B -= 2 * controller.damping * frequency * omega_B
         expected = inertia_B @ acceleration_B + np.cross(omega_B, inertia_B @ omega_B)
         np.testing.assert_allclose(found[i], expected, rtol=2e-3, atol=2e-4)
         checked += 1

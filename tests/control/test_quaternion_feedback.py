@@ -8,6 +8,7 @@ from support.states import MODEL, actions, random_states, state_of, states_of
 from koz_jax.control import feedback
 from koz_jax.control.quaternion_feedback import QuaternionFeedback
 from koz_jax.task import rotations
+from koz_jax.task.any_spacecraft import units
 from koz_jax.task.state import nominal, propagate
 
 
@@ -28,7 +29,7 @@ def test_pd_brakes_in_time():
     far = states_of(
         jnp.eye(4)[1:], jnp.zeros((3, 3)), jnp.tile(jnp.eye(4)[0], (3, 1)), jnp.zeros((3, 0, 3)), jnp.zeros((3, 0))
     )
-    controller = QuaternionFeedback(bandwidth=2.0, rate_bandwidth=2.0, torque_share=0.9)
+    controller = QuaternionFeedback(bandwidth=11.0, rate_bandwidth=11.0, torque_share=0.9)
 
     def one(state):
         def advance(state, _):
@@ -46,8 +47,8 @@ def test_pd_brakes_in_time():
 
 def test_pd_without_saturation_has_a_lyapunov_function():
     """V = |e|^2 + |w + k e|^2 / (k r) falls along every motion; e: error vector, k, r: the two bandwidths."""
-    controller = QuaternionFeedback(bandwidth=1.0, rate_bandwidth=3.0)
-    k, r = float(controller.bandwidth), float(controller.rate_bandwidth)
+    controller = QuaternionFeedback(bandwidth=5.5, rate_bandwidth=16.5)
+    k, r = (float(gain / units.of(MODEL).time) for gain in (controller.bandwidth, controller.rate_bandwidth))
     rng = np.random.default_rng(1)
     step = MODEL.replace(dt=jnp.float32(0.01))
     target, no_axes, no_angles = jnp.eye(4)[0], jnp.zeros((0, 3)), jnp.zeros(0)
