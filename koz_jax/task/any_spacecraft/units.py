@@ -41,7 +41,8 @@ def policy_axes(boresight_B: jax.Array) -> jax.Array:
     """
     x, y, z = boresight_B
     opposite = x < -1.0 + 1e-6
-    share = 1.0 / jnp.where(opposite, 1.0, 1.0 + x)
+    # 1 / (1 + x), by 1 - x^2 = y^2 + z^2 where the sum cancels.
+    share = jnp.where(x < 0.0, 1.0 - x, 1.0) / jnp.where(opposite, 1.0, jnp.where(x < 0.0, y * y + z * z, 1.0 + x))
     turned = jnp.stack(
         [
             boresight_B,
