@@ -3,6 +3,11 @@
 >>> policy = load_policy("phase2")
 >>> observer = observer_of(policy)
 >>> action = policy.predict(observer.observe(q_BN, omega_BN_B, q_DN, zones))  # once in every time step
+
+A policy for any spacecraft sees one in its own units and axes, and its action is an angular acceleration:
+
+>>> observer = scaled_observer_of(policy, spacecraft, step_seconds)
+>>> torque_B = observer.torque(policy.predict(observer.observe(q_BN, omega_BN_B, q_DN, zones)))
 """
 
 from collections.abc import Sequence
@@ -13,9 +18,12 @@ import numpy.typing as npt
 
 from koz_jax.agents.numpy_policy import NumpyPolicy
 from koz_jax.config import attitudes
+from koz_jax.config.task import SpacecraftConfig
+from koz_jax.errors import SettingsError
 from koz_jax.task import host
+from koz_jax.task.any_spacecraft import constants
 from koz_jax.task.host import Cones
-from koz_jax.task.observation_layout import ABSENT_HALF_ANGLE, layout, zone_part
+from koz_jax.task.observation_layout import ABSENT_HALF_ANGLE, ACTION_SIZE, layout, zone_part
 
 
 class Observer:
@@ -52,7 +60,7 @@ class Observer:
                 instrument as a third.
 
         Returns:
-            The observation (16,), 5 entries more for each further zone that the policy sees.
+            The observation (16,), 5 entries more for each further zone that the policy sees; see ``layout``.
 
         Raises:
             SettingsError: something is not finite or has another shape, or is no unit vector or quaternion, or no half
@@ -66,11 +74,17 @@ class Observer:
         q_e = host.attitude_error(q_BN, q_DN)
         q_e = host.nearer(q_e, np.array([1.0, 0.0, 0.0, 0.0]) if last is None else last)
         self._last_q_e = q_e
+        q_e0_previous = q_e[0] if last is None else last[0]
+        return self._pack(q_BN, omega_BN_B, q_e, q_e0_previous, nearest)
+
+    def _pack(
+        self, q_BN: host.Floats, omega_BN_B: host.Floats, q_e: host.Floats, q_e0_previous: float, nearest: Cones
+    ) -> npt.NDArray[np.float32]:
         parts: dict[str, Any] = {
             "q_e": q_e,
             "omega_BN_B": omega_BN_B,
             "boresight_B": nearest.boresight_B[0],
-            "q_e0_previous": [q_e[0] if last is None else last[0]],
+            "q_e0_previous": [q_e0_previous],
         }
         for number in range(self._observed_zones):
             zone = Cones(*(leaf[number] for leaf in nearest))
@@ -78,10 +92,119 @@ class Observer:
         return np.concatenate([parts[name] for name in layout(self._observed_zones)]).astype(np.float32)
 
 
+class ScaledObserver(Observer):
+    """What a policy for any spacecraft sees of one, in its units and axes, and the torque that its actions ask for.
+
+    Where zones are of several instruments, the axes are those of the nearest zone's.
+    """
+
+    def __init__(
+        self, spacecraft: SpacecraftConfig, step_seconds: float, urgency: float = 0.5, observed_zones: int = 1
+    ) -> None:
+        """Begin a maneuver.
+
+        Args:
+            spacecraft: what turns, and its instrument.
+            step_seconds: time step, over which the torque is held [s].
+            urgency: from 0 (thrifty) to 1 (as fast as the torque allows); see ``set_urgency``.
+            observed_zones: how many zones the policy sees.
+
+        Raises:
+            SettingsError: the time step is not above 0, or the urgency not in [0, 1].
+
+        """
+        super().__init__(spacecraft.boresight, observed_zones)
+        if not 0.0 < step_seconds < np.inf:
+            raise SettingsError(f"step_seconds: must be above 0, got {step_seconds}")
+        self.set_urgency(urgency)
+        self._spacecraft, self._step_seconds = spacecraft, step_seconds
+        self._own = constants.of(spacecraft, step_seconds)
+        self._seen = self._own
+
+    def set_urgency(self, urgency: float) -> None:
+        """Hurry more or less from the next step on.
+
+        urgency: from 0 (thrifty) to 1 (as fast as the torque allows).
+
+        Raises:
+            SettingsError: it is not in [0, 1].
+
+        """
+        if not 0.0 <= urgency <= 1.0:
+            raise SettingsError(f"urgency: must be in [0, 1], got {urgency}")
+        self._urgency = urgency
+
+    def torque(self, action: npt.ArrayLike) -> npt.NDArray[np.float32]:
+        """Torque that an action asks for in the situation that was observed last.
+
+        action: (3,) in [-1, 1].  Returns (3,) [N m] in body axes, within the torque limits.
+
+        Raises:
+            SettingsError: the action is not finite or has another shape.
+
+        """
+        asked_B = self._seen.torque_per_action @ host.numbers("action", action, (ACTION_SIZE,))
+        return np.clip(asked_B, -self._seen.torque_limits, self._seen.torque_limits).astype(np.float32)
+
+    def _pack(
+        self, q_BN: host.Floats, omega_BN_B: host.Floats, q_e: host.Floats, q_e0_previous: float, nearest: Cones
+    ) -> npt.NDArray[np.float32]:
+        same = np.array_equal(nearest.boresight_B[0], self._boresight_B)
+        self._seen = self._own if same else constants.of(self._spacecraft, self._step_seconds, nearest.boresight_B[0])
+        axes = self._seen.axes
+        parts: dict[str, Any] = {
+            "q_e": [q_e[0], *(axes @ q_e[1:])],
+            "omega_BN_P": self._seen.time * (axes @ omega_BN_B),
+            **self._seen.seen,
+            "urgency": [2.0 * self._urgency - 1.0],
+        }
+        for number in range(self._observed_zones):
+            zone = _zone_parts(q_BN, Cones(*(leaf[number] for leaf in nearest)), masked=True)
+            zone["zone_direction_P"] = axes @ zone["zone_direction_B"]
+            parts |= {zone_part(number, name): value for name, value in zone.items()}
+        return np.concatenate([parts[name] for name in layout(self._observed_zones, scaled=True)]).astype(np.float32)
+
+
 def observer_of(policy: NumpyPolicy) -> Observer:
-    """The observer that a policy needs: its number of zones, and the boresight that it was trained for."""
+    """The observer of a policy for one spacecraft: its number of zones, and the boresight that it was trained for.
+
+    Raises:
+        SettingsError: the policy is for any spacecraft.
+
+    """
     record = policy.record
+    if record.network.scaled:
+        raise SettingsError(f"policy: {policy.name} is for any spacecraft; scaled_observer_of observes one for it")
     return Observer(record.task.spacecraft.boresight, record.network.observed_zones)
+
+
+def scaled_observer_of(
+    policy: NumpyPolicy,
+    spacecraft: SpacecraftConfig | None = None,
+    step_seconds: float | None = None,
+    urgency: float = 0.5,
+) -> ScaledObserver:
+    """The observer of a policy for any spacecraft that flies one.
+
+    Args:
+        policy: who flies.
+        spacecraft: what turns, such as ``load_spacecraft(path).task.spacecraft``; by default that of the policy's task.
+        step_seconds: time step [s], such as ``load_spacecraft(path).task.step_seconds``; by default likewise.
+        urgency: from 0 (thrifty) to 1 (as fast as the torque allows).
+
+    Raises:
+        SettingsError: the policy is for one spacecraft, a spacecraft is told without its time step, or something is out
+            of range.
+
+    """
+    network, task = policy.record.network, policy.record.task
+    if not network.scaled:
+        raise SettingsError(f"policy: {policy.name} was trained for one spacecraft; observer_of observes for it")
+    if spacecraft is not None and step_seconds is None:
+        raise SettingsError("step_seconds: must be told with a spacecraft of one's own, got None")
+    return ScaledObserver(
+        spacecraft or task.spacecraft, step_seconds or task.step_seconds, urgency, network.observed_zones
+    )
 
 
 def _nearest(q_BN: host.Floats, zones: Cones, count: int) -> Cones:

@@ -3,9 +3,8 @@
 import math
 
 from koz_jax.config.training import NetworkConfig
+from koz_jax.sac.dials import Dials
 from koz_jax.task.observation_layout import FREE_RATE, slices
-
-Dials = tuple[tuple[int, float, float], ...]  # (entry, low, high)
 
 # [1/T] Least rate limit that a policy tells apart.
 SLOWEST_RATE = 0.15

@@ -8,8 +8,9 @@ import optax
 from flax import struct
 
 from koz_jax.sac import losses
+from koz_jax.sac.dials import Dials
 from koz_jax.sac.losses import Batch
-from koz_jax.sac.networks import Dials, Encoding, Params, Policy, SquashedGaussian, TwinCritic
+from koz_jax.sac.networks import Encoding, Params, Policy, SquashedGaussian, TwinCritic
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,12 +7,10 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from koz_jax.sac.dials import DIAL_FEATURES, Dials, spacing
+
 Params = Any  # a pytree of arrays, as flax makes it
 Encoding = tuple[tuple[int, int, float], ...]  # (start, stop, scale): also feed tanh(observation[start:stop] / scale)
-Dials = tuple[tuple[int, float, float], ...]  # (entry, low, high): entries of the observation that modulate all layers
-
-# Gaussian features of a dial, evenly spaced over its range.
-DIAL_FEATURES = 5
 
 # Bounds on the policy's log standard deviation, as in Stable-Baselines3.
 LOG_STD_MIN = -20.0
@@ -52,8 +50,8 @@ def dial_features(observation: jax.Array, dials: Dials) -> jax.Array:
     """Gaussian features of each dial.  observation: (..., n).  Returns (..., dials * DIAL_FEATURES)."""
     features = [jnp.zeros((*observation.shape[:-1], 0))]
     for entry, low, high in dials:
-        spacing = (high - low) / (DIAL_FEATURES - 1)
-        steps = (observation[..., entry, None] - low) / spacing - jnp.arange(DIAL_FEATURES, dtype=jnp.float32)
+        centres = jnp.arange(DIAL_FEATURES, dtype=jnp.float32)
+        steps = (observation[..., entry, None] - low) / spacing(low, high) - centres
         features.append(jnp.exp(-0.5 * steps**2))
     return jnp.concatenate(features, axis=-1)
 

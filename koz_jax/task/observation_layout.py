@@ -43,6 +43,9 @@ SHORTEST_STEP = 0.01
 # [1/T] A limit of the rate above this is none.
 FREE_RATE = 3.0
 
+# [u / J] An action of one of a policy for any spacecraft asks for this acceleration; the torque box then limits it.
+FULL_ACTION = 2.0
+
 # For those who only get an exported controller.
 _MEANING = {
     "q_e": "attitude error q_DN* (x) q_BN, scalar first; of it and its negative, which are one attitude, the one nearer"
@@ -60,6 +63,14 @@ _MEANING = {
     "step": f"natural logarithm of the time step over {SHORTEST_STEP} T, at least 0",
     "rate_limit": f"natural logarithm of the largest rate over {FREE_RATE} / T, at most 0: there is no limit",
     "urgency": "from -1 (thrifty) to 1 (as fast as the torque allows)",
+}
+
+# What differs for a policy for any spacecraft.
+_SCALED_MEANING = {
+    "q_e": f"{_MEANING['q_e']}; its vector part in the policy's axes",
+    "zone_margin": f"{_MEANING['zone_margin']}; pi where there is no zone",
+    "zone_angle": f"{_MEANING['zone_angle']}; pi where there is no zone",
+    "zone_direction_P": f"{_MEANING['zone_direction_P']}, or there is no zone",
 }
 
 
@@ -88,11 +99,11 @@ def zone_part(number: int, name: str) -> str:
     return f"{number + 1}_{name}" if number else name
 
 
-def meaning(part: str) -> str:
-    """What a part of the layout holds: frame, unit, definition."""
+def meaning(part: str, scaled: bool = False) -> str:
+    """What a part of ``layout(zones, scaled)`` holds: frame, unit, definition."""
     number, _, name = part.partition("_")
     if not number.isdigit():
-        return _MEANING[part]
+        return (_SCALED_MEANING if scaled else _MEANING).get(part, _MEANING[part])
     absent = "0" if name.startswith("zone_direction") else "pi"
     return f"the same of zone {number} in the order of the margins; {absent} where there is none"
 

@@ -11,12 +11,9 @@ import jax.numpy as jnp
 from koz_jax.task import dynamics, observation, pointing_constraints, rotations
 from koz_jax.task.any_spacecraft import units
 from koz_jax.task.any_spacecraft.units import Units
-from koz_jax.task.observation_layout import FREE_RATE, SHORTEST_STEP, layout, zone_part
+from koz_jax.task.observation_layout import FREE_RATE, FULL_ACTION, SHORTEST_STEP, layout, zone_part
 from koz_jax.task.pointing_constraints import PointingConstraint
 from koz_jax.task.state import EnvState, Model, attitude_error, torque_limits
-
-# [u / J] An action of one asks for this acceleration; the torque box then limits it.
-FULL_ACTION = 2.0
 
 
 def observe(state: EnvState, model: Model, urgency: jax.Array | float, zones: int = 1) -> jax.Array:
