@@ -128,7 +128,7 @@ def _universal() -> TrainConfig:
                 )
             ),
             "eval_cases": 400,
-            "refine_eval_every": 250,
+            "refine_eval_every": 500,
             "network": NetworkConfig(
                 hidden_sizes=(128, 128), encoding=EncodingConfig(rate_scales=(0.016, 0.16)), scaled=True
             ),
@@ -139,11 +139,12 @@ def _universal() -> TrainConfig:
                     "effort_weight": 3.46,
                     "urgency_factor": 11.5,
                     "rate_weight": 20.0,
+                    "change_weight": 5.0,
                     "max_maneuver_gradient": 0.1,
                     "state_gradient": (1.0, 300.0),
                     "max_gradient_norm": 1.0,
                     "scenarios": 96,
-                    "iterations": 2000,
+                    "iterations": 4000,
                 }
             ),
         }

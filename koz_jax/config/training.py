@@ -94,8 +94,8 @@ class RefineConfig(Settings):
     max_maneuver_gradient: NonNegativeFloat = 0.0
     """The same for each maneuver by itself, so that all have a say; one that is not finite is left out.  0 does not."""
     state_gradient: tuple[PositiveFloat, PositiveFloat] | None = None
-    """Bound on the gradient that passes back from step to step, at the first and at the last iteration: a policy that
-    chatters has useful gradients over few steps only.  None sets no bound."""
+    """Bound on the gradient that passes back from step to step, at the first iteration and from a quarter of them on: a
+    policy that chatters has useful gradients over few steps only.  None sets no bound."""
     min_angle_deg: DeviationDeg = 30.0
     """Smallest initial deviation [deg]."""
     max_angle_deg: DeviationDeg = 180.0
@@ -108,6 +108,8 @@ class RefineConfig(Settings):
     """Cost per step of the squared action: trades effort against time."""
     urgency_factor: PositiveFloat = 1.0
     """Factor on that weight at urgency 0, and its inverse at urgency 1; 1 trains one trade only."""
+    change_weight: NonNegativeFloat = 0.0
+    """Cost per step of the squared change of the action: makes torques smooth."""
     rate_weight: NonNegativeFloat = 0.0
     """Cost per step of a rate at its limit."""
     zone_weight: NonNegativeFloat = 2.0

@@ -84,7 +84,7 @@ def rate_cost(rate: jax.Array, limit: jax.Array) -> jax.Array:
 
 
 def step_cost(outcome: Outcome, env: Reorientation, config: RefineConfig) -> jax.Array:
-    """Smooth cost of one step: pointing at several resolutions, effort, and the zone.  Returns ()."""
+    """Smooth cost of one step: pointing at several resolutions, effort, its change, and the zone.  Returns ()."""
     phi = env.reward.angle_factor * outcome.angle
     pointing = sum(
         weight * jnp.tanh(phi / jnp.deg2rad(scale))
@@ -96,7 +96,10 @@ def step_cost(outcome: Outcome, env: Reorientation, config: RefineConfig) -> jax
         env.reward.zone_decay * config.zone_steepness,
         jnp.deg2rad(config.zone_tightening_deg),
     )
-    return pointing + effort_weight(env, config) * squared_action + config.zone_weight * env.reward.zone_height * zone
+    cost = pointing + effort_weight(env, config) * squared_action + config.zone_weight * env.reward.zone_height * zone
+    if config.change_weight:
+        cost = cost + config.change_weight * (outcome.torque_change / env.nominal_limits.scale) ** 2
+    return cost
 
 
 def maneuver_environment(config: TrainConfig) -> Reorientation:
@@ -162,7 +165,7 @@ def _reach(config: RefineConfig, iteration: jax.Array) -> jax.Array | None:
     if config.state_gradient is None:
         return None
     first, last = config.state_gradient
-    return first * (last / first) ** (iteration / max(config.iterations, 1))
+    return first * (last / first) ** jnp.minimum(4.0 * iteration / max(config.iterations, 1), 1.0)
 
 
 def _mean_gradient(

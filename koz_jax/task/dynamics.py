@@ -14,6 +14,7 @@ class RigidBodyState(struct.PyTreeNode):
     omega_BN_B: jax.Array  # (3,) [rad/s], body relative to inertial, in body axes
 
 
+@jax.jit
 def matvec(matrix: jax.Array, vector: jax.Array) -> jax.Array:
     """Matrix times vector, as a sum of columns.  matrix: (3, 3), vector: (3,).  Returns (3,)."""
     m = [[matrix[i, j] for j in range(3)] for i in range(3)]
@@ -21,6 +22,7 @@ def matvec(matrix: jax.Array, vector: jax.Array) -> jax.Array:
     return jnp.stack([row[0] * v1 + row[1] * v2 + row[2] * v3 for row in m])
 
 
+@jax.jit
 def inverse(inertia_B: jax.Array) -> jax.Array:
     """Inverse of a symmetric matrix by cofactors.  inertia_B: (3, 3).  Returns (3, 3)."""
     c1, c2, c3 = inertia_B
@@ -28,11 +30,13 @@ def inverse(inertia_B: jax.Array) -> jax.Array:
     return adjugate / rotations.dot(c1, adjugate[0])
 
 
+@jax.jit
 def gyroscopic_torque(omega_BN_B: jax.Array, inertia_B: jax.Array) -> jax.Array:
     """w x (I w), the torque that keeps a rate.  omega_BN_B: (3,) [rad/s]; inertia_B: (3, 3).  Returns (3,) [N m]."""
     return rotations.cross(omega_BN_B, matvec(inertia_B, omega_BN_B))
 
 
+@jax.jit
 def angular_acceleration(
     omega_BN_B: jax.Array, torque_B: jax.Array, inertia_B: jax.Array, inverse_inertia_B: jax.Array
 ) -> jax.Array:
@@ -43,11 +47,13 @@ def angular_acceleration(
     return matvec(inverse_inertia_B, torque_B - gyroscopic_torque(omega_BN_B, inertia_B))
 
 
+@jax.jit
 def attitude_rate(q_BN: jax.Array, omega_BN_B: jax.Array) -> jax.Array:
     """Kinematics, dq/dt = q (x) (0, w) / 2 (Eq. 1).  q_BN: (4,); omega_BN_B: (3,) [rad/s].  Returns (4,) [1/s]."""
     return 0.5 * rotations.multiply(q_BN, jnp.concatenate([jnp.zeros_like(omega_BN_B[:1]), omega_BN_B]))
 
 
+@jax.jit
 def step(state: RigidBodyState, torque_B: jax.Array, inertia_B: jax.Array, dt: jax.Array | float) -> RigidBodyState:
     """One Runge-Kutta step of order 4 with the torque held (zero-order hold), attitude renormalised.
 

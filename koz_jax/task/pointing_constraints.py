@@ -55,21 +55,25 @@ def axis_B(q_BN: jax.Array, constraint: PointingConstraint) -> jax.Array:
     return rotations.rotate(rotations.conjugate(q_BN), constraint.axis_N)
 
 
+@jax.jit
 def angle_to_axis(q_BN: jax.Array, constraint: PointingConstraint) -> jax.Array:
     """theta, the angle between the boresight and the cone's axis.  q_BN: (4,).  Returns () [rad]."""
     return rotations.angle_between(boresight_N(q_BN, constraint), constraint.axis_N)
 
 
+@jax.jit
 def margin(q_BN: jax.Array, constraint: PointingConstraint) -> jax.Array:
     """theta_margin = theta - theta_F; the constraint is violated when it is <= 0.  q_BN: (4,).  Returns () [rad]."""
     return angle_to_axis(q_BN, constraint) - constraint.half_angle
 
 
+@jax.jit
 def margins(q_BN: jax.Array, constraints: PointingConstraint) -> jax.Array:
     """Margin of each of several constraints.  q_BN: (4,).  Returns (constraints,) [rad]."""
     return jax.vmap(margin, in_axes=(None, 0))(q_BN, constraints)
 
 
+@jax.jit
 def smallest_margin(q_BN: jax.Array, constraints: PointingConstraint) -> jax.Array:
     """Margin of the constraint that is nearest to being violated.  q_BN: (4,).  Returns () [rad]."""
     return jnp.min(margins(q_BN, constraints))
