@@ -88,7 +88,8 @@ def check(
     vectors = golden(agent, _OBSERVATIONS, seed=1)
     difference = np.abs(predict(vectors.observation) - vectors.action).max() / _ACTION_RANGE
     start = time.perf_counter()
-    found = fly_cases(HostController(predict, agent.controller.network.observed_zones), agent.task, config)
+    network = agent.controller.network
+    found = fly_cases(HostController(predict, network.observed_zones, network.scaled), agent.task, config)
     seconds = time.perf_counter() - start
     differing = np.flatnonzero((found.settled != flown.settled) | (found.violated != flown.violated))
     print(f"{name}: largest difference of an action over {_OBSERVATIONS} observations: {difference:.1e} of the range")

@@ -14,6 +14,7 @@ from koz_jax.cli.exit_status import exit_status
 from koz_jax.cli.flags import parsing
 from koz_jax.cli.flags.flight import AGENT
 from koz_jax.config.base import MarginDeg, Settings
+from koz_jax.config.maneuvers.maneuver_file import load_spacecraft
 from koz_jax.config.shield import CERTAIN, ShieldConfig, UncertaintyConfig
 
 
@@ -25,6 +26,9 @@ class _FormatFlags(Settings):
     """c: C99 with a self-test and an example; onnx: a graph for onnxruntime; stablehlo: a program for XLA."""
     out: Path
     """Folder to write into; the files of an earlier export to the same format are replaced."""
+    spacecraft: Path | None = None
+    """Of an agent for any spacecraft, the one that it is exported for, and the shield with it: a TOML file with a table
+    [spacecraft] and step_seconds, such as a maneuver file; by default that of the agent's task."""
     shield: bool = False
     """Also write the shield, which keeps the boresight out of every zone; for --to c."""
     shield_margin_deg: MarginDeg = parsing.same_as(ShieldConfig, "margin_deg")
@@ -72,7 +76,8 @@ def _export(asked: ExportFlags) -> int:
     from koz_jax.export.files import export, write_files
     from koz_jax.storage.files import make_folder
 
+    task = None if asked.spacecraft is None else load_spacecraft(asked.spacecraft).task
     make_folder("out", asked.out)
-    for path in write_files(asked.out, export(load_agent(asked.agent), asked.to, asked.shield_config)):
+    for path in write_files(asked.out, export(load_agent(asked.agent), asked.to, asked.shield_config, task)):
         print(path)
     return 0

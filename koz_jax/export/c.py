@@ -1,11 +1,10 @@
 """C99 source of a controller, and of its shield: no allocation, fixed loops, constants, nothing beyond libm."""
 
+import hashlib
 import importlib.resources
-from collections.abc import Iterable
 
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike
 
 from koz_jax.agents.numpy_policy import NumpyPolicy, exported_zone_count
 from koz_jax.config.base import Vector
@@ -13,8 +12,9 @@ from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import TaskConfig
 from koz_jax.control.shield import brake_path, guide
 from koz_jax.control.shield import filter as shield
+from koz_jax.export import c_network, c_observation, c_text
 from koz_jax.export.golden import EXAMPLE_CASE, Golden
-from koz_jax.export.metadata import Metadata, as_text, describe
+from koz_jax.export.metadata import Metadata, as_text
 from koz_jax.export.shield_golden import ShieldGolden
 from koz_jax.task import dynamics, environment, pointing_constraints
 from koz_jax.task.observation_layout import ACTION_SIZE, size
@@ -31,45 +31,43 @@ _TORQUE_TOLERANCE = "1e-3"
 _EXAMPLE_ROWS = 20
 
 
-def c_files(policy: NumpyPolicy, vectors: Golden, example: np.ndarray) -> dict[str, bytes]:
+def c_files(policy: NumpyPolicy, metadata: Metadata, vectors: Golden, example: np.ndarray) -> dict[str, bytes]:
     """Headers, source, self-test with golden vectors, example, and Makefile, by file name.
 
     example: (11 + 4 zones,) the situation in which the example's maneuver starts.
     """
-    metadata = describe(policy)
     network = metadata.network
     replacements = {
+        **c_observation.replacements(metadata, vectors),
         "HEAD": _head(metadata),
-        "OBSERVATION_SIZE": str(size(network.observed_zones)),
+        "OBSERVATION_SIZE": str(size(network.observed_zones, network.scaled)),
         "ZONES": str(exported_zone_count(network, metadata.task.scenario)),
         "OBSERVED_ZONES": str(network.observed_zones),
         "ACTION_SIZE": str(ACTION_SIZE),
         **_limits(metadata.torque_limit),
-        "STEP_SECONDS": _number(metadata.step_seconds),
+        "STEP_SECONDS": c_text.number(metadata.step_seconds),
         "CONFIG_SHA256": metadata.provenance.config_sha256 or "unknown",
         "TRAINING_SHA256": metadata.training_sha256,
         "EXPORT_ID": _export_id(metadata),
         "WEIGHTS_SHA256": metadata.weights_sha256,
-        "BORESIGHT": _row(metadata.boresight_B),
-        "WEIGHTS": "\n\n".join(_weights(policy)),
-        "RELU": _RELU if len(policy.layers) > 1 else "",
-        "DECIDE": "\n".join(f"    {line}" for line in _decide(policy)),
+        "BORESIGHT": c_text.row(metadata.boresight_B),
+        "WEIGHTS": c_network.weights(policy),
+        "HELPERS": c_network.helpers(policy),
+        "DECIDE": c_network.decide(policy),
         "COUNT": str(len(vectors.action)),
         "ACTION_TOLERANCE": _ACTION_TOLERANCE,
         "OBSERVATION_TOLERANCE": _OBSERVATION_TOLERANCE,
-        "SITUATIONS": _situations(vectors.situation, policy),
-        "MEMORIES": ",\n".join(f"    {{{_braced(q_e)}}}" for q_e in vectors.memory),
-        "SITUATION": _situations(example[None], policy).strip(),
+        "SITUATIONS": c_text.situations(vectors.situation),
+        "SITUATION": c_text.situation(example),
         **_example(metadata.task),
-        "OBSERVATIONS": _rows(vectors.observation),
-        "ACTIONS": _rows(vectors.action),
+        "OBSERVATIONS": c_text.rows(vectors.observation),
+        "ACTIONS": c_text.rows(vectors.action),
     }
     return {name: _fill(name, replacements).encode() for name in C_FILES}
 
 
-def shield_files(policy: NumpyPolicy, config: ShieldConfig, vectors: ShieldGolden) -> dict[str, bytes]:
-    """Header, source and self-test of a shield for the spacecraft of a policy, by file name."""
-    metadata = describe(policy)
+def shield_files(metadata: Metadata, config: ShieldConfig, vectors: ShieldGolden) -> dict[str, bytes]:
+    """Header, source and self-test of a shield for the spacecraft of an exported policy, by file name."""
     model = environment.model_from_config(metadata.task)
     made = shield.from_config(config, model)
     replacements = {
@@ -82,9 +80,9 @@ def shield_files(policy: NumpyPolicy, config: ShieldConfig, vectors: ShieldGolde
         "SAMPLES": str(made.brake.samples),
         "COUNT": str(len(vectors.allowed)),
         "TOLERANCE": _TORQUE_TOLERANCE,
-        "SITUATIONS": _situations(vectors.situation, policy),
-        "REQUESTED": _rows(vectors.requested),
-        "ALLOWED": _rows(vectors.allowed),
+        "SITUATIONS": c_text.situations(vectors.situation),
+        "REQUESTED": c_text.rows(vectors.requested),
+        "ALLOWED": c_text.rows(vectors.allowed),
         "SAFE": ", ".join(str(int(safe)) for safe in vectors.safe),
         **_shield_constants(made, model, metadata),
     }
@@ -113,11 +111,11 @@ def _shield_constants(made: shield.Shield, model: Model, metadata: Metadata) -> 
     }
     shares = {"REQUEST_SHARES": shield.REQUEST_SHARES, "GUIDE_SHARES": shield.GUIDE_SHARES}
     return {
-        "INERTIA": _matrix(model.inertia_B),
-        "INVERSE_INERTIA": _matrix(dynamics.inverse(model.inertia_B)),
+        "INERTIA": c_text.matrix(model.inertia_B),
+        "INVERSE_INERTIA": c_text.matrix(dynamics.inverse(model.inertia_B)),
         **{f"{name}_COUNT": str(len(values)) for name, values in shares.items()},
-        **{name: _row(values) for name, values in shares.items()},
-        **{name: _number(float(value)) for name, value in numbers.items()},
+        **{name: c_text.row(values) for name, values in shares.items()},
+        **{name: c_text.number(float(value)) for name, value in numbers.items()},
     }
 
 
@@ -131,8 +129,8 @@ def _example(task: TaskConfig) -> dict[str, str]:
         "STEPS": str(task.episode_steps),
         "ROW_STEPS": str(max(1, task.episode_steps // _EXAMPLE_ROWS)),
         "SETTLED_DEG": repr(float(settled_deg)),
-        "EXACT_BORESIGHT": _exact_row(task.spacecraft.boresight),
-        **{f"EXACT_{name}": ", ".join(f"{{{_exact_row(row)}}}" for row in rows) for name, rows in exact.items()},
+        "EXACT_BORESIGHT": c_text.exact_row(task.spacecraft.boresight),
+        **{f"EXACT_{name}": ", ".join(f"{{{c_text.exact_row(row)}}}" for row in rows) for name, rows in exact.items()},
     }
 
 
@@ -140,20 +138,20 @@ def _limits(limit: float | Vector) -> dict[str, str]:
     """What templates say of the torque limits: a constant where all axes have the same, a macro of the axis else."""
     if not isinstance(limit, tuple):
         return {
-            "LIMIT_DEFINITION": f"KOZ_TORQUE_LIMIT {_number(limit)} /* [N m] about each body axis */",
+            "LIMIT_DEFINITION": f"KOZ_TORQUE_LIMIT {c_text.number(limit)} /* [N m] about each body axis */",
             "LIMIT_OF_I": "KOZ_TORQUE_LIMIT",
             "LARGEST_LIMIT": "KOZ_TORQUE_LIMIT",
             "LARGEST_TORQUE": "sqrtf(3.0f) * KOZ_TORQUE_LIMIT",
             "SHARE_OF_I": "",
             "SHARE": " / KOZ_TORQUE_LIMIT",
         }
-    x, y, z = (_number(each) for each in limit)
+    x, y, z = (c_text.number(each) for each in limit)
     choice = f"((axis) == 0 ? {x} : (axis) == 1 ? {y} : {z})"
     return {
         "LIMIT_DEFINITION": f"KOZ_TORQUE_LIMIT(axis) {choice} /* [N m] about a body axis */",
         "LIMIT_OF_I": "KOZ_TORQUE_LIMIT(i)",
-        "LARGEST_LIMIT": _number(max(limit)),
-        "LARGEST_TORQUE": _number(float(np.linalg.norm(limit))),
+        "LARGEST_LIMIT": c_text.number(max(limit)),
+        "LARGEST_TORQUE": c_text.number(float(np.linalg.norm(limit))),
         "SHARE_OF_I": " / KOZ_TORQUE_LIMIT(i)",
         "SHARE": "",
     }
@@ -161,7 +159,10 @@ def _limits(limit: float | Vector) -> dict[str, str]:
 
 def _export_id(metadata: Metadata) -> str:
     """A number that files of one controller share, for the preprocessor."""
-    return f"0x{metadata.training_sha256[:8]}"
+    if metadata.scaling is None:
+        return f"0x{metadata.training_sha256[:8]}"
+    content = metadata.training_sha256 + metadata.task.model_dump_json()
+    return f"0x{hashlib.sha256(content.encode()).hexdigest()[:8]}"
 
 
 def _head(metadata: Metadata) -> str:
@@ -173,78 +174,3 @@ def _fill(name: str, replacements: dict[str, str]) -> str:
     for key, value in replacements.items():
         text = text.replace(f"@{key}@", value)
     return text
-
-
-def _number(value: float) -> str:
-    """The shortest float32 constant that reads back as the same bits."""
-    return f"{np.float32(value)!s}f"  # without !s it would have the digits of a float64
-
-
-def _row(values: Iterable[float]) -> str:
-    return ", ".join(_number(value) for value in values)
-
-
-def _exact_row(values: Iterable[float]) -> str:
-    return ", ".join(repr(float(value)) for value in values)
-
-
-def _rows(table: np.ndarray) -> str:
-    return ",\n".join(f"    {_braced(row)}" for row in table)
-
-
-def _matrix(rows: ArrayLike) -> str:
-    return ", ".join(_braced(row) for row in np.asarray(rows))
-
-
-def _situations(rows: np.ndarray, policy: NumpyPolicy) -> str:
-    zones = exported_zone_count(policy.record.network, policy.record.task.scenario)
-    return ",\n".join(_situation(row, zones) for row in rows)
-
-
-def _situation(row: np.ndarray, zones: int) -> str:
-    q_BN, omega, q_DN, axes, half_angles = np.split(row, np.cumsum([4, 3, 4, 3 * zones]))
-    attitude = ", ".join(_braced(part) for part in (q_BN, omega, q_DN))
-    axis_rows = ", ".join(_braced(axis) for axis in axes.reshape(zones, 3))
-    return f"    {{{attitude}, {{{axis_rows}}}, {_braced(half_angles)}}}"
-
-
-def _braced(values: Iterable[float]) -> str:
-    return f"{{{_row(values)}}}"
-
-
-def _weights(policy: NumpyPolicy) -> Iterable[str]:
-    for number, layer in enumerate(policy.layers):
-        inputs, outputs = layer.kernel.shape
-        kernel = ",\n".join(f"    {_row(row)}" for row in layer.kernel)
-        yield f"static const float kernel_{number}[{inputs} * {outputs}] = {{\n{kernel}\n}};"
-        yield f"static const float bias_{number}[{outputs}] = {{{_row(layer.bias)}}};"
-
-
-_RELU = """static void relu(float *x, int size)
-{
-    int i;
-    for (i = 0; i < size; i++) x[i] = x[i] < 0.0f ? 0.0f : x[i];
-}
-
-"""
-
-
-def _decide(policy: NumpyPolicy) -> Iterable[str]:
-    """Body of ``koz_decide``: encode, layer by layer, tanh."""
-    shapes = [layer.kernel.shape for layer in policy.layers]
-    for number, (inputs, _) in enumerate(shapes):
-        yield f"float x{number}[{inputs}];"
-    yield "int i;"
-    yield "for (i = 0; i < KOZ_OBSERVATION_SIZE; i++) x0[i] = observation[i];"
-    at = size(policy.record.network.observed_zones)
-    for start, stop, scale in policy.views:
-        seen = f"x0[{at} + i] = tanhf(observation[{start} + i] / {_number(scale)});"
-        yield f"for (i = 0; i < {stop - start}; i++) {seen}"
-        at += stop - start
-    for number, (inputs, outputs) in enumerate(shapes):
-        last = number == len(shapes) - 1
-        into = "action" if last else f"x{number + 1}"
-        yield f"dense(x{number}, {inputs}, kernel_{number}, bias_{number}, {outputs}, {into});"
-        if not last:
-            yield f"relu({into}, {outputs});"
-    yield "for (i = 0; i < KOZ_ACTION_SIZE; i++) action[i] = tanhf(action[i]);"

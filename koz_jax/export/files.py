@@ -1,43 +1,81 @@
 """Exports as files: what an agent becomes in each format, and how that replaces an earlier export."""
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
 from koz_jax.agents.agent import Agent
 from koz_jax.config.shield import ShieldConfig
+from koz_jax.config.spread import SpreadConfig
+from koz_jax.config.task import TaskConfig
 from koz_jax.errors import SettingsError
 from koz_jax.export.c import C_FILES, SHIELD_FILES, c_files, shield_files
 from koz_jax.export.golden import example, golden
+from koz_jax.export.metadata import describe
 from koz_jax.export.shield_golden import shield_golden
 from koz_jax.storage import files
 
 GOLDEN_VECTORS = 100
 
 
-def export(agent: Agent, to: Literal["c", "onnx", "stablehlo"], shield: ShieldConfig | None = None) -> dict[str, bytes]:
+def export(
+    agent: Agent,
+    to: Literal["c", "onnx", "stablehlo"],
+    shield: ShieldConfig | None = None,
+    task: TaskConfig | None = None,
+) -> dict[str, bytes]:
     """Contents of the exported files by their names.
 
-    shield: of C only; None leaves it out.
+    Args:
+        agent: who is exported.
+        to: format.
+        shield: of C only; None leaves it out.
+        task: of an agent for any spacecraft, with the one that it is exported for; see ``made_for``.
 
     Raises:
         MissingExtraError: a package that the format needs is not installed.
-        SettingsError: the shield cannot be.
+        SettingsError: the shield cannot be, or the agent is of one spacecraft and is asked to fly another.
 
     """
+    made = made_for(agent, task)
+    policy = agent.to_numpy()
+    metadata = describe(policy, made.task, float(agent.controller.urgency))
     # What only one format needs is imported for that format.
     if to == "onnx":
         from koz_jax.export.onnx import onnx_files
 
-        return onnx_files(agent.to_numpy())
+        return onnx_files(policy, metadata)
     if to == "stablehlo":
         from koz_jax.export.stablehlo import stablehlo_files
 
-        return stablehlo_files(agent)
-    contents = c_files(agent.to_numpy(), golden(agent, GOLDEN_VECTORS), example(agent))
+        return stablehlo_files(agent, metadata)
+    contents = c_files(policy, metadata, golden(made, GOLDEN_VECTORS), example(made))
     if shield is None:
         return contents
-    return contents | shield_files(agent.to_numpy(), shield, shield_golden(agent, shield, GOLDEN_VECTORS))
+    return contents | shield_files(metadata, shield, shield_golden(made, shield, GOLDEN_VECTORS))
+
+
+def made_for(agent: Agent, task: TaskConfig | None = None) -> Agent:
+    """The agent on the one spacecraft that it is exported for.
+
+    task: with its spacecraft, time step, and length and rates of maneuvers, such as ``load_spacecraft(path).task``; by
+    default the agent's own.  Zones are those that the agent was trained for.
+
+    Raises:
+        SettingsError: a task is told for an agent that is of one spacecraft.
+
+    """
+    if not agent.controller.network.scaled:
+        if task is None:
+            return agent
+        raise SettingsError(
+            f"spacecraft: {agent.name} was trained for one spacecraft and can be exported for no other; leave it out"
+        )
+    own = task or agent.task
+    zones = agent.task.scenario.model_copy(update={"max_rate_deg": own.scenario.max_rate_deg})
+    one = own.model_copy(update={"spread": SpreadConfig(), "scenario": zones})
+    return dataclasses.replace(agent, task=one)
 
 
 def write_files(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:

@@ -11,8 +11,10 @@ from flax import struct
 from koz_jax.agents.agent import Agent
 from koz_jax.agents.numpy_policy import exported_zone_count
 from koz_jax.config.monte_carlo import MonteCarloConfig
+from koz_jax.config.training import NetworkConfig
 from koz_jax.evaluation.cases import draw_case
 from koz_jax.task import environment, observation, rotations, state
+from koz_jax.task.any_spacecraft import nondimensional
 from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.observation_layout import ABSENT_HALF_ANGLE
 from koz_jax.task.pointing_constraints import PointingConstraint
@@ -46,20 +48,27 @@ class Golden(NamedTuple):
     """Situations and the answers to them; float32, leading axis (count,)."""
 
     situation: np.ndarray  # (count, 11 + 4 zones), the fields of ``Situation`` side by side; attitudes of either sign
-    memory: np.ndarray  # (count, 4) q_e one step ago, of the sign that is continuous with the observation's
+    memory: np.ndarray  # (count, 4) q_e one step ago, of the sign that is continuous with the observation's; (count, 5)
+    # with the urgency where the policy sees one
     observation: np.ndarray  # (count, entries)
     action: np.ndarray  # (count, 3)
+    torque: np.ndarray  # (count, 3) [N m] body axes
 
 
 def golden(agent: Agent, count: int, seed: int = 0) -> Golden:
-    """Draw situations and answer them."""
+    """Draw situations, and urgencies where the policy sees one, and answer them."""
     drawn = situations(agent, count, seed)
     model, boresight_B = known(agent)
-    memory, observed = _observe(drawn, model, boresight_B, agent.controller.network.observed_zones)
+    network = agent.controller.network
+    rng = np.random.default_rng(seed)
     # Sensors may hand over either sign, and what is observed stays the same.
-    sign = np.random.default_rng(seed).choice([-1.0, 1.0], (count, 1)).astype(np.float32)
-    handed_over = drawn.replace(q_BN=sign * drawn.q_BN)
-    return Golden(rows(handed_over), np.asarray(memory), np.asarray(observed), agent.predict(np.asarray(observed)))
+    sign = rng.choice([-1.0, 1.0], (count, 1)).astype(np.float32)
+    urgency = rng.uniform(size=(count, 1)).astype(np.float32)
+    memory, observed = map(np.asarray, _observe(drawn, urgency[:, 0], model, boresight_B, network))
+    action = agent.predict(observed)
+    torque = np.asarray(_torque(drawn, action, model, boresight_B, network))
+    memory = np.concatenate([memory, urgency], axis=1) if network.scaled else memory
+    return Golden(rows(drawn.replace(q_BN=sign * drawn.q_BN)), memory, observed, action, torque)
 
 
 def example(agent: Agent) -> np.ndarray:
@@ -87,11 +96,13 @@ def situations(agent: Agent, count: int, seed: int = 0) -> Situation:
 
     Angles to the target and rates are spread evenly over the orders of magnitude between resting on the target and
     turning towards it from the other side; targets and zones are anywhere, and some zones after the first are absent.
+    For a policy for any spacecraft, rates are those of the paper's in units of its own.
     """
     rng = np.random.default_rng(seed)
     limits = agent.task.scenario
     angle = jnp.deg2rad(10 ** rng.uniform(np.log10(_SMALLEST_ANGLE_DEG), np.log10(180.0), count))
-    rate = _LARGEST_RATE * 10 ** rng.uniform(-4.0, 0.0, count)
+    largest_rate = _LARGEST_RATE * (agent.task.time_to_paper if agent.controller.network.scaled else 1.0)
+    rate = largest_rate * 10 ** rng.uniform(-4.0, 0.0, count)
     q_DN, q_e = directions(rng, count, 4), jax.vmap(rotations.from_axis_angle)(directions(rng, count, 3), angle)
     zones = exported_zone_count(agent.controller.network, limits)
     half_angle = np.deg2rad(rng.uniform(limits.min_half_angle_deg, limits.max_half_angle_deg, (count, zones)))
@@ -116,18 +127,35 @@ def known(agent: Agent) -> tuple[Model, jax.Array]:
     return environment.model_from_config(agent.task), jnp.array(agent.task.spacecraft.boresight)
 
 
-@functools.partial(jax.jit, static_argnames="observed_zones")
+@functools.partial(jax.jit, static_argnames="network")
 def _observe(
-    drawn: Situation, model: Model, boresight_B: jax.Array, observed_zones: int
+    drawn: Situation, urgency: jax.Array, model: Model, boresight_B: jax.Array, network: NetworkConfig
 ) -> tuple[jax.Array, jax.Array]:
     """Attitude errors one step ago, at the same rate, and what is observed now; leading axis (count,)."""
 
-    def one(situation: Situation) -> tuple[jax.Array, jax.Array]:
+    def one(situation: Situation, urgency: jax.Array) -> tuple[jax.Array, jax.Array]:
         now = situation.state(model, boresight_B)
         turned = model.dt * situation.omega_BN_B
         angle = rotations.norm(turned)
         back = rotations.from_axis_angle(turned / jnp.where(angle > 0.0, angle, 1.0), -angle)
         before = rotations.multiply(state.attitude_error(now), back)
-        return before, observation.observe(now.replace(q_e0_previous=before[0]), observed_zones)
+        now = now.replace(q_e0_previous=before[0])
+        if network.scaled:
+            return before, nondimensional.observe(now, model, urgency, network.observed_zones)
+        return before, observation.observe(now, network.observed_zones)
 
-    return jax.vmap(one)(drawn)
+    return jax.vmap(one)(drawn, urgency)
+
+
+@functools.partial(jax.jit, static_argnames="network")
+def _torque(
+    drawn: Situation, action: jax.Array, model: Model, boresight_B: jax.Array, network: NetworkConfig
+) -> jax.Array:
+    """What actuators make of actions (count, 3) in these situations.  Returns (count, 3) [N m]."""
+
+    def one(situation: Situation, action: jax.Array) -> jax.Array:
+        at = situation.state(model, boresight_B)
+        command = nondimensional.command(action, at, model) if network.scaled else action
+        return model.actuators.apply(command, at.actuators)[0]
+
+    return jax.vmap(one)(drawn, action)

@@ -11,8 +11,6 @@ import numpy as np
 from koz_jax.errors import SettingsError
 from koz_jax.task.observation_layout import ACTION_SIZE
 
-_MEMORY_SIZE = 4  # of ``koz_memory``
-
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 
 
@@ -47,6 +45,8 @@ class CLibrary:
             int(re.findall(rf"#define {name} (\d+)", header)[0]) for name in ("KOZ_ZONES", "KOZ_OBSERVATION_SIZE")
         )
         self._situation_size = 11 + 4 * self.zones
+        # q_e, and an urgency where the policy sees one.
+        self._memory_size = 5 if "#define KOZ_URGENCY" in header else 4
         for name, pointers in (("start", 2), ("observe", 3), ("decide", 2), ("torque", 2)):
             getattr(self._functions, f"koz_{name}").argtypes = (ctypes.c_void_p,) * pointers
             getattr(self._functions, f"koz_{name}").restype = None
@@ -64,19 +64,22 @@ class CLibrary:
         return [None if fault is None else fault.decode() for fault in found]
 
     def start(self, situations: np.ndarray) -> np.ndarray:
-        """Begin maneuvers in these situations (batch, 11 + 4 zones).  Returns memories (batch, 4) for ``observe``."""
+        """Begin maneuvers in these situations (batch, 11 + 4 zones).
+
+        Returns memories (batch, 4) for ``observe``; of a policy for any spacecraft (batch, 5), the last its urgency.
+        """
         told = _rows_of("situations", situations, self._situation_size)
-        memories = np.empty((len(told), _MEMORY_SIZE), np.float32)
+        memories = np.empty((len(told), self._memory_size), np.float32)
         self._each("koz_start", memories, told)
         return memories
 
     def observe(self, situations: np.ndarray, memories: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Observations (batch, entries) of situations (batch, 11 + 4 zones), and the memories (batch, 4) from then on.
+        """Observations (batch, entries) of situations (batch, 11 + 4 zones), and the memories from then on.
 
         situations: ``koz_situation`` field by field; memories: of ``start``, or of the step before.
         """
         told = _rows_of("situations", situations, self._situation_size)
-        kept = _rows_of("memories", memories, _MEMORY_SIZE).copy()
+        kept = _rows_of("memories", memories, self._memory_size).copy()
         _check_as_many("memories", kept, told)
         observations = np.empty((len(told), self._observation_size), np.float32)
         self._each("koz_observe", kept, told, observations)

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import textwrap
+from collections.abc import Iterable
 
 from koz_jax.agents.numpy_policy import NumpyPolicy
 from koz_jax.agents.record import Provenance, Record
@@ -10,6 +11,7 @@ from koz_jax.config.base import Settings, Vector
 from koz_jax.config.task import ScenarioConfig, TaskConfig
 from koz_jax.config.training import NetworkConfig
 from koz_jax.config.version import version
+from koz_jax.task.any_spacecraft import constants
 from koz_jax.task.observation_layout import layout, meaning, slices
 
 
@@ -22,13 +24,40 @@ class Entry(Settings):
     meaning: str
 
 
+_ACTION = "three numbers in [-1, 1]; times torque_limit that is the torque in body axes [N m], held for a step"
+_SCALED_ACTION = (
+    "three numbers in [-1, 1], an angular acceleration in the policy's axes; the matrix torque_per_action times them,"
+    " clipped to plus or minus torque_limit about each body axis, is the torque in body axes [N m], held for a step"
+)
+
+
+class Scaling(Settings):
+    """How a policy for any spacecraft sees and moves the one that it was exported for."""
+
+    time_unit: float
+    """T = sqrt(J / u) [s]."""
+    inertia_unit: float
+    """J [kg m^2], a third of the trace of the inertia."""
+    torque_unit: float
+    """u [N m], the root mean square of the torque limits."""
+    axes: tuple[Vector, Vector, Vector]
+    """The policy's axes, rows in body components: v_P = axes v_B."""
+    seen: dict[str, tuple[float, ...]]
+    """Parts of the observation that are the same all the time."""
+    torque_per_action: tuple[Vector, Vector, Vector]
+    """[N m] Takes an action to a torque in body axes."""
+    urgency: float
+    """Urgency where none is set, from 0 (thrifty) to 1 (as fast as the torque allows); the observation holds twice that
+    minus 1."""
+
+
 class Metadata(Settings):
     """What a user of an exported controller must know; goes to and from JSON."""
 
     name: str
     koz_jax_version: str
     observation: tuple[Entry, ...]
-    action: str = "three numbers in [-1, 1]; times torque_limit that is the torque in body axes [N m], held for a step"
+    action: str = _ACTION
     torque_limit: float | Vector  # [N m] about each body axis: one number for all, or one for each
     step_seconds: float
     boresight_B: tuple[float, float, float]
@@ -37,29 +66,57 @@ class Metadata(Settings):
     network: NetworkConfig
     task: TaskConfig
     provenance: Provenance
+    scaling: Scaling | None = None
+    """Of a policy for any spacecraft."""
+
+    def to_json(self, indent: int | None = None) -> str:
+        """What exported files hold."""
+        return self.model_dump_json(indent=indent, exclude=None if self.scaling else {"scaling"})
 
 
-def describe(policy: NumpyPolicy) -> Metadata:
-    """Metadata of a policy."""
+def describe(policy: NumpyPolicy, task: TaskConfig | None = None, urgency: float = 0.5) -> Metadata:
+    """Metadata of a policy.
+
+    task: with the spacecraft that it is exported for, by default its own; urgency: where none is set, of a policy that
+    sees one.
+    """
     record = policy.record
-    zones = record.network.observed_zones
-    where = slices(zones)
-    limits = record.task.spacecraft.torque_limits
+    task = task or record.task
+    zones, scaled = record.network.observed_zones, record.network.scaled
+    where = slices(zones, scaled)
+    limits = task.spacecraft.torque_limits
     return Metadata(
         name=policy.name,
         koz_jax_version=version(),
         observation=tuple(
-            Entry(name=name, start=where[name].start, size=size, meaning=meaning(name))
-            for name, size in layout(zones).items()
+            Entry(name=name, start=where[name].start, size=size, meaning=meaning(name, scaled))
+            for name, size in layout(zones, scaled).items()
         ),
+        action=_SCALED_ACTION if scaled else _ACTION,
         torque_limit=limits[0] if len({*limits}) == 1 else limits,
-        step_seconds=record.task.step_seconds,
-        boresight_B=record.task.spacecraft.boresight,
+        step_seconds=task.step_seconds,
+        boresight_B=task.spacecraft.boresight,
         training_sha256=training_sha256(record),
         weights_sha256=weights_sha256(policy),
         network=record.network,
-        task=record.task,
+        task=task,
         provenance=record.provenance,
+        scaling=_scaling(task, urgency) if scaled else None,
+    )
+
+
+def _scaling(task: TaskConfig, urgency: float) -> Scaling:
+    own = constants.of(task.spacecraft, task.step_seconds)
+    return Scaling.model_validate(
+        {
+            "time_unit": own.time,
+            "inertia_unit": own.inertia,
+            "torque_unit": own.torque,
+            "axes": own.axes.tolist(),
+            "seen": {name: own.seen[name].tolist() for name in layout(scaled=True) if name in own.seen},
+            "torque_per_action": own.torque_per_action.tolist(),
+            "urgency": urgency,
+        }
     )
 
 
@@ -70,11 +127,13 @@ def training_sha256(record: Record) -> str:
 
 
 def weights_sha256(policy: NumpyPolicy) -> str:
-    """Hash of the exported weights: kernel and bias of each layer as little-endian float32."""
+    """Hash of the exported weights: kernel, bias and gain of each layer as little-endian float32."""
     digest = hashlib.sha256()
     for layer in policy.layers:
         digest.update(layer.kernel.astype("<f4").tobytes())
         digest.update(layer.bias.astype("<f4").tobytes())
+        if layer.gain is not None:
+            digest.update(layer.gain.astype("<f4").tobytes())
     return digest.hexdigest()
 
 
@@ -88,6 +147,7 @@ def as_text(metadata: Metadata) -> str:
         " q_BN takes body components to inertial ones.",
         *(_entry_text(entry) for entry in metadata.observation),
         f"Action: {metadata.action}.",
+        *(_scaling_text(metadata.scaling) if metadata.scaling else ()),
         f"Limits: torque {_torque(metadata.torque_limit)}; time step {metadata.step_seconds:g} s;"
         f" boresight {list(metadata.boresight_B)} in body axes; inertia {[list(r) for r in task.spacecraft.inertia]}"
         f" kg m^2; trained for {_count(task.scenario)} of {task.scenario.min_half_angle_deg:g} to"
@@ -100,6 +160,22 @@ def as_text(metadata: Metadata) -> str:
     ]
     wrapped = (piece for line in lines for piece in textwrap.wrap(line, 110, subsequent_indent="    ") or [""])
     return "\n".join(wrapped).replace("\\", "/").replace("*/", "* /").replace("/*", "/ *")
+
+
+def _scaling_text(scaling: Scaling) -> list[str]:
+    def text(values: Iterable[float]) -> str:
+        return ", ".join(f"{value:.6g}" for value in values)
+
+    def matrix(rows: Iterable[Vector]) -> str:
+        return "[" + ", ".join(f"[{text(row)}]" for row in rows) + "]"
+
+    seen = "; ".join(f"{name} {text(values)}" for name, values in scaling.seen.items())
+    return [
+        f"Units of this spacecraft: T = sqrt(J / u) = {scaling.time_unit:.6g} s, J = {scaling.inertia_unit:.6g} kg m^2,"
+        f" u = {scaling.torque_unit:.6g} N m. The policy's axes have x along the boresight; their rows in body"
+        f" components: {matrix(scaling.axes)}. torque_per_action: {matrix(scaling.torque_per_action)} N m."
+        f" Constant parts of the observation: {seen}. Urgency u01 in [0, 1] is seen as 2 u01 - 1.",
+    ]
 
 
 def _count(scenario: ScenarioConfig) -> str:

@@ -9,13 +9,13 @@ from jax.export import Exported
 
 from koz_jax.agents.agent import Agent
 from koz_jax.errors import missing_extra
-from koz_jax.export.metadata import Metadata, as_text, describe
+from koz_jax.export.metadata import Metadata, as_text
 from koz_jax.task.observation_layout import size
 
 _PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 
 
-def stablehlo_files(agent: Agent) -> dict[str, bytes]:
+def stablehlo_files(agent: Agent, metadata: Metadata) -> dict[str, bytes]:
     """Three files by name.
 
     - ``koz_policy.mlir``: the program as text, observation (entries,) to action (3,), for any compiler of StableHLO.
@@ -28,8 +28,7 @@ def stablehlo_files(agent: Agent) -> dict[str, bytes]:
         MissingExtraError: a package that serialisation needs is not installed.
 
     """
-    metadata = describe(agent.to_numpy())
-    entries = size(metadata.network.observed_zones)
+    entries = size(metadata.network.observed_zones, metadata.network.scaled)
     (batch,) = jax.export.symbolic_shape("batch")
     try:
         serialised = _exported(agent, metadata, (batch, entries), _PLATFORMS).serialize()
@@ -39,7 +38,7 @@ def stablehlo_files(agent: Agent) -> dict[str, bytes]:
     return {
         "koz_policy.mlir": (head + _exported(agent, metadata, (entries,), ("cpu",)).mlir_module()).encode(),
         "koz_policy.jax_export": bytes(serialised),
-        "koz_policy.json": (metadata.model_dump_json(indent=2) + "\n").encode(),
+        "koz_policy.json": (metadata.to_json(indent=2) + "\n").encode(),
     }
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import oracle
+from support import oracle, spacecraft
 
 from koz_jax.agents.agent import Agent, load_agent
 from koz_jax.config.monte_carlo import MonteCarloConfig
@@ -58,20 +58,21 @@ def run(*command: object, **environment: str) -> subprocess.CompletedProcess[str
 def of_other_task(agent: Agent) -> Agent:
     """Unequal torque limits, and up to three zones."""
     task = agent.task
-    spacecraft = task.spacecraft.model_copy(update={"torque_limit": UNEQUAL})
+    body = task.spacecraft.model_copy(update={"torque_limit": UNEQUAL})
     scenario = task.scenario.model_copy(update={"max_zones": 3})
-    return dataclasses.replace(agent, task=task.model_copy(update={"spacecraft": spacecraft, "scenario": scenario}))
+    return dataclasses.replace(agent, task=task.model_copy(update={"spacecraft": body, "scenario": scenario}))
 
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
-@pytest.mark.parametrize("kind", ["plain", "robust", "unequal"])
+@pytest.mark.parametrize("kind", ["plain", "robust", "unequal", "scaled"])
 def test_everything_compiles_without_a_warning(agent, folder, tmp_path, compiler, kind):
     if shutil.which(compiler) is None:
         pytest.skip(f"there is no {compiler}")
     where = folder
     if kind != "plain":
         where = tmp_path
-        write_files(where, export(of_other_task(agent) if kind == "unequal" else agent, "c", ROBUST))
+        exported = {"robust": agent, "unequal": of_other_task(agent), "scaled": spacecraft.agent()}[kind]
+        write_files(where, export(exported, "c", ROBUST))
     for name in SOURCES:
         for defined in ((), ("-DKOZ_WITH_SHIELD",)):
             run(compiler, *WARNINGS, *defined, "-c", where / name, "-o", tmp_path / "out.o")

@@ -19,7 +19,8 @@ from koz_jax.config.training import NO_ENCODING
 from koz_jax.errors import SettingsError
 from koz_jax.evaluation import cases
 from koz_jax.evaluation.rollout import CaseResult
-from koz_jax.export.c import C_FILES, _number
+from koz_jax.export.c import C_FILES
+from koz_jax.export.c_text import number
 from koz_jax.export.files import export, write_files
 from koz_jax.export.golden import Golden, golden
 from koz_jax.export.library import STRICT, CLibrary
@@ -333,6 +334,6 @@ def test_every_format_is_exported_anew_in_its_place(agent, tmp_path):
 
 @pytest.mark.parametrize("value", [0.1, 1e-5, -2.0, 0.016608869656920433, 3.4e38])
 def test_constants_are_the_shortest_that_read_back(value):
-    text = _number(value)
+    text = number(value)
     assert text.endswith("f") and np.float32(text[:-1]) == np.float32(value)
     assert len(text) <= len("-1.23456789e-38f")

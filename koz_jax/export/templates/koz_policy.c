@@ -54,13 +54,13 @@ static void remember(koz_memory *memory, const koz_situation *unit)
 
 void koz_start(koz_memory *memory, const koz_situation *now)
 {
-    const koz_memory on_target = {{1.0f, 0.0f, 0.0f, 0.0f}};
+    const koz_memory on_target = {{1.0f, 0.0f, 0.0f, 0.0f}@MEMORY_START@};
     const koz_situation unit = koz_unit_situation(now);
     *memory = on_target;
     remember(memory, &unit);
 }
 
-/* Unit vector from the boresight towards a zone's axis; zero where the two coincide. */
+@SPACECRAFT@/* Unit vector from the boresight towards a zone's axis; zero where the two coincide. */
 static void zone_direction(const koz_situation *unit, int zone, float direction_B[3])
 {
     float to_body[4], axis_B[3];
@@ -77,34 +77,26 @@ void koz_observe(koz_memory *memory, const koz_situation *now, float observation
     float angle[KOZ_ZONES], margin[KOZ_ZONES], boresight_N[3];
     int seen[KOZ_ZONES];
     int i, zone, place, nearest;
-    observation[15] = memory->q_e[0];
-    remember(memory, &unit);
-    for (i = 0; i < 4; i++) observation[i] = memory->q_e[i];
-    for (i = 0; i < 3; i++) {
-        observation[4 + i] = unit.omega_BN_B[i];
-        observation[7 + i] = koz_boresight_B[i];
-    }
-    koz_rotate(unit.q_BN, koz_boresight_B, boresight_N);
+@OBSERVE_BODY@    koz_rotate(unit.q_BN, koz_boresight_B, boresight_N);
     for (zone = 0; zone < KOZ_ZONES; zone++) {
         angle[zone] = koz_angle(boresight_N, unit.zone_axis_N[zone]);
         margin[zone] = angle[zone] - unit.zone_half_angle[zone];
         seen[zone] = 0;
     }
     for (place = 0; place < KOZ_OBSERVED_ZONES; place++) {
-        float *part = observation + (place == 0 ? 10 : 11 + 5 * place);
+        float *part = observation + @ZONE_PLACE@;
         nearest = -1;
         for (zone = 0; zone < KOZ_ZONES; zone++)
             if (!seen[zone] && (nearest < 0 || margin[zone] < margin[nearest])) nearest = zone;
         seen[nearest] = 1;
         part[0] = margin[nearest];
         part[1] = angle[nearest];
-        zone_direction(&unit, nearest, part + 2);
-        if (place > 0 && unit.zone_half_angle[nearest] <= 0.0f) {
+@ZONE_DIRECTION@        if (@WHICH_ABSENT@unit.zone_half_angle[nearest] <= 0.0f) {
             part[0] = part[1] = pi;
             part[2] = part[3] = part[4] = 0.0f;
         }
     }
-}
+@OBSERVE_SPACECRAFT@}
 
 /* y = x kernel + bias */
 static void dense(const float *x, int inputs, const float *kernel, const float *bias, int outputs, float *y)
@@ -115,15 +107,11 @@ static void dense(const float *x, int inputs, const float *kernel, const float *
         for (j = 0; j < outputs; j++) y[j] += x[i] * kernel[i * outputs + j];
 }
 
-@RELU@void koz_decide(const float observation[KOZ_OBSERVATION_SIZE], float action[KOZ_ACTION_SIZE])
+@HELPERS@void koz_decide(const float observation[KOZ_OBSERVATION_SIZE], float action[KOZ_ACTION_SIZE])
 {
 @DECIDE@
 }
 
 void koz_torque(const float observation[KOZ_OBSERVATION_SIZE], float torque_B[KOZ_ACTION_SIZE])
 {
-    int i;
-    koz_decide(observation, torque_B);
-    for (i = 0; i < KOZ_ACTION_SIZE; i++)
-        torque_B[i] = fabsf(torque_B[i]) <= 1.0f ? torque_B[i] * @LIMIT_OF_I@ : 0.0f;
-}
+@TORQUE@}

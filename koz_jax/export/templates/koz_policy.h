@@ -10,7 +10,7 @@
 #define KOZ_ACTION_SIZE @ACTION_SIZE@
 #define @LIMIT_DEFINITION@
 #define KOZ_STEP_SECONDS @STEP_SECONDS@ /* [s] between decisions; the torque is held in between */
-#define KOZ_CONFIG_SHA256 "@CONFIG_SHA256@" /* config.json of the training run */
+@URGENCY_DEFINITION@#define KOZ_CONFIG_SHA256 "@CONFIG_SHA256@" /* config.json of the training run */
 #define KOZ_TRAINING_SHA256 "@TRAINING_SHA256@" /* network, task and origin */
 #define KOZ_WEIGHTS_SHA256 "@WEIGHTS_SHA256@"
 #define KOZ_EXPORT_ID @EXPORT_ID@
@@ -34,7 +34,7 @@ typedef struct {
 /* What the controller keeps from one step to the next. */
 typedef struct {
     float q_e[4]; /* attitude error of the last step, its sign continuous in time */
-} koz_memory;
+@MEMORY_FIELD@} koz_memory;
 
 /* NULL where a situation can be used, else which of its fields cannot be, and why. */
 const char *koz_fault(const koz_situation *now);

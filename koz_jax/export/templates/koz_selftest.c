@@ -31,7 +31,7 @@ static const float observations[COUNT][KOZ_OBSERVATION_SIZE] = {
 static const float actions[COUNT][KOZ_ACTION_SIZE] = {
 @ACTIONS@
 };
-
+@TORQUES@
 /* Largest difference so far; not a number counts as the largest. */
 static double worse(double worst, float found, float expected)
 {
@@ -51,12 +51,11 @@ int main(void)
         memory = memories[n];
         koz_observe(&memory, &situations[n], observation);
         for (i = 0; i < KOZ_OBSERVATION_SIZE; i++) observed = worse(observed, observation[i], observations[n][i]);
-        for (i = 0; i < 4; i++) observed = worse(observed, memory.q_e[i], observations[n][i]);
-        koz_decide(observations[n], action);
+@MEMORY_CHECK@        koz_decide(observations[n], action);
         koz_torque(observations[n], torque_B);
         for (i = 0; i < KOZ_ACTION_SIZE; i++) {
             decided = worse(decided, action[i], actions[n][i]);
-            applied = worse(applied, torque_B[i], @LIMIT_OF_I@ * actions[n][i]);
+            applied = worse(applied, torque_B[i], @EXPECTED_TORQUE@);
         }
     }
     koz_start(&memory, &situations[0]);

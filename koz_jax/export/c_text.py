@@ -1,0 +1,50 @@
+"""Numbers, tables and situations as C99 source."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+def number(value: float) -> str:
+    """The shortest float32 constant that reads back as the same bits."""
+    return f"{np.float32(value)!s}f"  # without !s it would have the digits of a float64
+
+
+def row(values: Iterable[float]) -> str:
+    """float32 constants between commas."""
+    return ", ".join(number(value) for value in values)
+
+
+def exact_row(values: Iterable[float]) -> str:
+    """The same in double precision."""
+    return ", ".join(repr(float(value)) for value in values)
+
+
+def braced(values: Iterable[float]) -> str:
+    """An initialiser of an array."""
+    return f"{{{row(values)}}}"
+
+
+def rows(table: np.ndarray) -> str:
+    """Initialisers of the rows (n, entries) of a table, one on a line."""
+    return ",\n".join(f"    {braced(each)}" for each in table)
+
+
+def matrix(table: ArrayLike) -> str:
+    """Initialisers of the rows of a small matrix, on one line."""
+    return ", ".join(braced(each) for each in np.asarray(table))
+
+
+def situations(table: np.ndarray) -> str:
+    """Initialisers of ``koz_situation``.  table: (n, 11 + 4 zones)."""
+    return ",\n".join(f"    {situation(each)}" for each in table)
+
+
+def situation(values: np.ndarray) -> str:
+    """Initialiser of a ``koz_situation``.  values: (11 + 4 zones,)."""
+    zones = (len(values) - 11) // 4
+    q_BN, omega, q_DN, axes, half_angles = np.split(values, np.cumsum([4, 3, 4, 3 * zones]))
+    attitude = ", ".join(braced(part) for part in (q_BN, omega, q_DN))
+    axis_rows = ", ".join(braced(axis) for axis in axes.reshape(zones, 3))
+    return f"{{{attitude}, {{{axis_rows}}}, {braced(half_angles)}}}"
