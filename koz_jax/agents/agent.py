@@ -15,6 +15,7 @@ from koz_jax.agents import numpy_policy
 from koz_jax.agents.numpy_policy import NumpyPolicy
 from koz_jax.agents.record import Provenance, Record, find_agent, read_agent_record
 from koz_jax.agents.sb3 import is_sb3, read_sb3
+from koz_jax.config.spread import SpreadConfig
 from koz_jax.config.task import TaskConfig
 from koz_jax.control.policy import PolicyController, policy_network
 from koz_jax.errors import SettingsError
@@ -110,4 +111,6 @@ def load_agent(
         ),
     )
     policy = archive.load_tree(folder, template)
-    return Agent(PolicyController(policy, record.network), record.task, record.provenance, str(name))
+    # What was spread in training is not what is flown unless somebody asks for it.
+    task = record.task.model_copy(update={"spread": SpreadConfig()})
+    return Agent(PolicyController(policy, record.network), task, record.provenance, str(name))

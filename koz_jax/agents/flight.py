@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from koz_jax.agents.agent import load_agent
+from koz_jax.agents.agent import Agent, load_agent
 from koz_jax.config.maneuvers.maneuver import ManeuverConfig
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.shield import ShieldConfig
@@ -12,14 +12,15 @@ from koz_jax.errors import SettingsError
 from koz_jax.evaluation import maneuver as maneuvers
 from koz_jax.evaluation.maneuver import FlownManeuver
 
-# Who flies where nobody is named, if it was made for the spacecraft.
-DEFAULT_AGENT = "phase2"
+# Who flies where nobody is named: the paper's spacecraft, and any other.
+DEFAULT_AGENT, DEFAULT_FOR_OTHERS = "phase2", "universal"
 
 
 def fly(
     maneuver: ManeuverConfig,
     agent: TaskController | Path | str | None = None,
     *,
+    urgency: float | None = None,
     shield: ShieldConfig | None = None,
     seed: int = 0,
     substeps: int = maneuvers.SUBSTEPS,
@@ -29,16 +30,17 @@ def fly(
     Args:
         maneuver: what is flown.
         agent: who flies: an agent or controller, the name of a built-in controller, ``FILE.py:CLASS``, or what
-            ``load_agent`` takes; by default the shipped agent, if it was made for the spacecraft.
+            ``load_agent`` takes; by default a shipped agent: the one of the paper's spacecraft, or the one for all.
+        urgency: how much an agent hurries that listens to it, from 0 (thrifty) to 1 (as fast as the torque allows).
         shield: to fly under; None flies without.
         seed: of what is random in flight: errors, and planners' searches.
         substeps: constraints are checked at so many instants of every step, at least 5.
 
     Raises:
-        SettingsError: there is no such agent or controller, or nobody was named for a spacecraft of one's own.
+        SettingsError: there is no such agent or controller, or it does not listen to the urgency.
 
     """
-    flying = load_for(maneuver, agent)
+    flying = load_for(maneuver, agent, urgency)
     if shield is not None:
         shield.check(maneuver.task.spacecraft.torque_limits)
     asked = MonteCarloConfig(seed=seed, shield=shield, substeps=substeps)
@@ -46,22 +48,34 @@ def fly(
     return maneuvers.fly_closely(flying, maneuvers.scenario(maneuver), maneuver.task, config)
 
 
-def load_for(maneuver: ManeuverConfig, agent: TaskController | Path | str | None = None) -> TaskController:
-    """Load who flies a maneuver; nobody by default where the default agent was not made for it.
+def load_for(
+    maneuver: ManeuverConfig, agent: TaskController | Path | str | None = None, urgency: float | None = None
+) -> TaskController:
+    """Load who flies a maneuver; by default the shipped agent that was made for its spacecraft.
 
-    agent: as of ``fly``.
+    agent, urgency: as of ``fly``.
 
     Raises:
-        SettingsError: there is no such agent or controller, or nobody was named for a spacecraft of one's own.
+        SettingsError: as of ``fly``.
 
     """
     if isinstance(agent, str) and (agent in BUILT_IN or ".py:" in agent):
         return load_controller(agent, maneuver.task)
-    flying = load_agent(agent or DEFAULT_AGENT) if agent is None or isinstance(agent, Path | str) else agent
-    other = maneuvers.unfamiliar(flying, maneuver)
-    if other and agent is None:
-        raise SettingsError(
-            f"agent: {DEFAULT_AGENT}, which flies by default, was not made for {maneuver.name!r} ({'; '.join(other)});"
-            " name who flies, such as --controller planner --shield, or --agent with an agent of your own"
-        )
-    return flying
+    if agent is None:
+        agent = load_agent(DEFAULT_AGENT)
+        if urgency is not None or maneuvers.unfamiliar(agent, maneuver):
+            agent = load_agent(DEFAULT_FOR_OTHERS)
+    flying = load_agent(agent) if isinstance(agent, Path | str) else agent
+    return flying if urgency is None else in_a_hurry(flying, urgency)
+
+
+def in_a_hurry(flying: TaskController, urgency: float) -> TaskController:
+    """The same with an urgency, from 0 (thrifty) to 1 (as fast as the torque allows).
+
+    Raises:
+        SettingsError: it is not in [0, 1], or who flies does not listen to it.
+
+    """
+    if not isinstance(flying, Agent):
+        raise SettingsError(f"urgency: is of agents, and {flying.name} has none; got {urgency}")
+    return flying.with_urgency(urgency)

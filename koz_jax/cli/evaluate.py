@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from pydantic import model_validator
 
 from koz_jax.cli import invocation
 from koz_jax.cli.exit_status import exit_status
@@ -43,6 +45,14 @@ class EvaluateFlags(ProcessFlags, FlightFlags, AgentFlags):
     """Fly only this case of the draw, and write its history."""
     history: Path | None = None
     """File for --replay-case; by default case-I.csv."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _for_any_spacecraft(cls, given: dict[str, Any]) -> dict[str, Any]:
+        """For another spacecraft or an urgency, the default is the agent that is for any."""
+        default = cls.model_fields["agent"].default
+        asks = given.get("spacecraft") is not None or given.get("urgency") is not None
+        return given | {"agent": "universal"} if asks and given.get("agent", default) == default else given
 
     def task(self, agent: TaskController) -> TaskConfig:
         """What is flown: the agent's task, or the paper's draw for another spacecraft, with the changes of the flags.

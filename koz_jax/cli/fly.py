@@ -14,11 +14,12 @@ from koz_jax.agents.record import find_agent, read_agent_record
 from koz_jax.cli import invocation
 from koz_jax.cli.exit_status import exit_status
 from koz_jax.cli.flags import parsing
-from koz_jax.cli.flags.flight import AGENT, CONTROLLERS
+from koz_jax.cli.flags.flight import AGENT, CONTROLLERS, URGENCY
 from koz_jax.cli.flags.one_case import OneCaseFlags
 from koz_jax.cli.flags.turn import TurnFlags
 from koz_jax.config.maneuvers.maneuver import ManeuverConfig
 from koz_jax.config.monte_carlo import MonteCarloConfig
+from koz_jax.config.spread import Urgency
 
 if TYPE_CHECKING:
     from koz_jax.config.task import TaskConfig
@@ -34,8 +35,9 @@ class FlyFlags(TurnFlags, OneCaseFlags):
 
     agent: str | None = Field(
         default=None,
-        description=f"Who flies: {AGENT}. By default {_DEFAULT_AGENT}, where the spacecraft is its own.",
+        description=f"Who flies: {AGENT}. By default {_DEFAULT_AGENT}; for another spacecraft, the one for any.",
     )
+    urgency: Urgency | None = Field(default=None, description=URGENCY)
     controller: str | None = Field(
         default=None, description=f"Fly this on the agent's task, or the maneuver's, in its place: {CONTROLLERS}."
     )
@@ -96,15 +98,19 @@ class FlyFlags(TurnFlags, OneCaseFlags):
 
         """
         from koz_jax.agents.agent import load_agent
-        from koz_jax.agents.flight import load_for
+        from koz_jax.agents.flight import DEFAULT_FOR_OTHERS, in_a_hurry, load_for
         from koz_jax.control.registry import load_controller
 
-        if self.own_maneuver is None:
-            agent = load_agent(self.agent or _DEFAULT_AGENT)
-            return agent if self.controller is None else load_controller(self.controller, agent.task)
+        own = self.own_maneuver
         if self.controller is not None:
-            return load_controller(self.controller, self.own_maneuver.task)
-        return load_for(self.own_maneuver, None if self.agent is None else load_agent(self.agent))
+            task = load_agent(self.agent or _DEFAULT_AGENT).task if own is None else own.task
+            flying = load_controller(self.controller, task)
+        elif own is not None:
+            return load_for(own, self.agent and load_agent(self.agent), self.urgency)
+        else:
+            default = _DEFAULT_AGENT if self.urgency is None else DEFAULT_FOR_OTHERS
+            flying = load_agent(self.agent or default)
+        return flying if self.urgency is None else in_a_hurry(flying, self.urgency)
 
 
 def main(argv: Sequence[str]) -> int:

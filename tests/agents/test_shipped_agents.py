@@ -6,6 +6,9 @@ import pytest
 from koz_jax.agents.agent import load_agent
 from koz_jax.agents.record import shipped_agents
 from koz_jax.config.monte_carlo import MonteCarloConfig
+from koz_jax.config.spread import SpreadConfig
+from koz_jax.config.task import TaskConfig
+from koz_jax.errors import SettingsError
 from koz_jax.evaluation import cases
 from koz_jax.evaluation.summary import PAPER_TABLE, summarise
 from koz_jax.task import scenario
@@ -19,17 +22,17 @@ def phase2_summary():
     return summarise(cases.fly_cases(agent.controller, agent.task, CASES))
 
 
-def test_the_shipped_agents_are_the_two_phases_phase_2_before_refinement_and_one_for_several_zones():
-    assert shipped_agents() == ("phase1", "phase2", "phase2-sac", "zones3")
+def test_the_shipped_agents_are_those_of_the_papers_spacecraft_one_for_several_zones_and_one_for_any_spacecraft():
+    assert shipped_agents() == ("phase1", "phase2", "phase2-sac", "universal", "zones3")
 
 
-@pytest.mark.parametrize("name", ["phase1", "phase2"])
-def test_an_agent_knows_where_it_comes_from(name):
+@pytest.mark.parametrize(("name", "phase"), [("phase1", 1), ("phase2", 2), ("universal", 2)])
+def test_an_agent_knows_where_it_comes_from(name, phase):
     provenance = load_agent(name).provenance
     assert provenance.command.startswith("python train.py")
     assert len(provenance.commit) == 40, "an agent is trained from a clean commit"
     assert provenance.table["cases"] == 10_000
-    assert provenance.phase == int(name[-1])
+    assert provenance.phase == phase
 
 
 def test_phase_1_flies_through_the_zone_of_the_papers_scenario_and_phase_2_around_it():
@@ -68,3 +71,38 @@ def test_the_agent_for_several_zones_flies_around_three_of_them():
     found = summarise(cases.fly_cases(agent.controller, task, CASES))
     assert found.success_rate >= 0.97
     assert found.violation_rate <= 0.005
+
+
+ANY_SPACECRAFT = TaskConfig(spread=SpreadConfig(spacecraft=True, step_shares=(0.02, 0.05)))
+
+
+@pytest.mark.slow
+def test_the_agent_for_any_spacecraft_flies_random_ones_at_every_urgency():
+    """More haste costs effort and saves time; success does not depend on it."""
+    found = []
+    for urgency in (0.0, 0.5, 1.0):
+        agent = load_agent("universal").with_urgency(urgency)
+        results = cases.fly_cases(agent.controller, ANY_SPACECRAFT, MonteCarloConfig(cases=200, seed=12))
+        assert np.mean(results.success) >= 0.99
+        found.append(summarise(results))
+    times, efforts = ([getattr(one, f"{name}_mean") for one in found] for name in ("settling_time", "control_effort"))
+    assert times == sorted(times, reverse=True) and efforts == sorted(efforts)
+    assert times[0] > 1.3 * times[2] and efforts[2] > 3.0 * efforts[0]
+
+
+@pytest.mark.slow
+def test_the_agent_for_any_spacecraft_keeps_a_rate_limit():
+    task = TaskConfig.model_validate({"spacecraft": {"max_rate_deg": 5.0}})
+    agent = load_agent("universal")
+    history, result = cases.fly_case(agent, 3, MonteCarloConfig(cases=10, seed=12), task)
+    assert result.success
+    assert np.linalg.norm(history.state.body.omega_BN_B, axis=1).max() < np.deg2rad(5.0) * 1.01
+    free, _ = cases.fly_case(agent, 3, MonteCarloConfig(cases=10, seed=12), TaskConfig())
+    assert np.linalg.norm(free.state.body.omega_BN_B, axis=1).max() > np.deg2rad(6.0)
+
+
+def test_an_urgency_is_refused_where_nobody_listens_and_where_it_is_none():
+    with pytest.raises(SettingsError, match="urgency: phase2 was trained for one trade of time against effort; got"):
+        load_agent("phase2").with_urgency(0.5)
+    with pytest.raises(SettingsError, match=r"urgency: must be in \[0, 1\], got nan"):
+        load_agent("universal").with_urgency(float("nan"))

@@ -14,6 +14,7 @@ from support import tiny
 
 from koz_jax.cli.evaluate import EvaluateFlags
 from koz_jax.cli.flags import parsing
+from koz_jax.config.maneuvers.maneuver_file import load_spacecraft
 from koz_jax.config.task import TaskConfig
 from koz_jax.evaluation import cases
 
@@ -24,7 +25,7 @@ JSON_KEYS = [
     *("control_effort_mean", "control_effort_std", "control_accuracy_deg_mean", "control_accuracy_deg_std"),
     *("non_settled_rate", "violation_rate", "success_rate"),
     *("min_margin_deg", "intervention_rate", "mean_torque_change", "deadlock_rate", "unsafe_start_rate"),
-    *("compile_s", "wall_s"),
+    *("settling_time_scaled_mean", "control_effort_scaled_mean", "compile_s", "wall_s"),
 ]
 
 
@@ -157,7 +158,7 @@ def test_table_json_and_csv_tell_the_same(capsys, run, empty_cwd):
     assert report["non_settled_rate"] == 1.0 and report["success_rate"] == 0.0
     assert [name for name in JSON_KEYS if report[name] is None] == [
         name for name in JSON_KEYS if "control" in name or "settling" in name
-    ][:6]
+    ]
 
     rows = list(csv.DictReader((empty_cwd / "x.csv").read_text().splitlines()))
     assert [int(row["case"]) for row in rows] == list(range(tiny.CASES))
@@ -264,3 +265,31 @@ def test_a_platform_that_is_not_there_is_named_in_a_line(empty_cwd, agent):
             continue  # it is there
         (line,) = done.stderr.splitlines()
         assert done.returncode == 2 and line.startswith(f"error: JAX_PLATFORMS: {name!r} cannot be used (")
+
+
+def test_another_spacecraft_is_flown_in_its_own_units(tmp_path):
+    """The draw is the paper's; times and rates follow T = sqrt(J / u), and scaled results are in the paper's units."""
+    path = tmp_path / "small.toml"
+    path.write_text(
+        "step_seconds = 0.05\n[spacecraft]\n"
+        "inertia = [[0.06, 0.005, 0.001], [0.005, 0.05, 0.002], [0.001, 0.002, 0.07]]\n"
+        "torque_limit = 0.02\n[[instruments]]\nname = 'telescope'\nboresight = [1, 0, 0]\n"
+    )
+    task = load_spacecraft(path).task
+    # The paper's shape with J / u a tenth: everything takes sqrt(1 / 10) of the time.
+    assert task.episode_seconds == pytest.approx(100.0 / 10**0.5)
+    assert task.scenario.max_rate_deg == pytest.approx(0.001 * 10**0.5)
+    assert task.time_to_paper == pytest.approx(10**0.5)
+    assert task.effort_to_paper == pytest.approx(100.0**2 * 10**0.5)
+
+
+def test_flags_of_the_agent_for_any_spacecraft():
+    flags = parsing.parse(EvaluateFlags, ["--spacecraft", "random"], "koz evaluate")
+    assert flags.agent == "universal"
+    assert parsing.parse(EvaluateFlags, ["--urgency", "0.2"], "koz evaluate").agent == "universal"
+    assert parsing.parse(EvaluateFlags, [], "koz evaluate").agent == "phase2"
+
+
+def test_a_spacecraft_that_cannot_be_read_is_refused(capsys, no_flight):
+    assert "spacecraft: no.toml cannot be read" in refused(capsys, "--spacecraft", "no.toml")
+    assert "urgency: phase1 was trained for one trade" in refused(capsys, "--agent", "phase1", "--urgency", 0.1)

@@ -193,8 +193,8 @@ REFUSED = {
     ),
     "rate limit": (
         "torque_limit = 0.004",
-        "torque_limit = 0.004\nmax_rate_deg = 3.0",
-        "spacecraft.max_rate_deg: not supported yet",
+        "torque_limit = 0.004\nmax_rate_deg = -3.0",
+        "spacecraft.max_rate_deg: Input should be greater than 0",
     ),
     "keep in": (
         'kind = "keep_out"',

@@ -1,5 +1,7 @@
 """Laws of the policy's distribution, the input encoding and the networks."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -176,13 +178,17 @@ def test_dials_modulate_every_layer_and_begin_as_none():
     """Weights of gains are zero at first: the layers then are those of a network that sees the features beside."""
     policy = Policy((8, 8), (), 2, DIALS)
     observed = jax.random.normal(jax.random.key(1), (5, 4))
-    params = policy.init(jax.random.key(0), observed)
-    gains = {name: leaf for name, leaf in params["params"]["Mlp_0"].items() if name.startswith("Gain")}
-    assert set(gains) == {"Gain_0", "Gain_1"}
-    assert all(not np.any(leaf["kernel"]) for leaf in gains.values())
-    before = policy.apply(params, observed).mean
+    params: Any = policy.init(jax.random.key(0), observed)
+    layers = params["params"]["Mlp_0"]
+    gains = {name: np.asarray(layer["kernel"]) for name, layer in layers.items() if name.startswith("Gain")}
+    assert set(gains) == {"Gain_0", "Gain_1"} and not any(gain.any() for gain in gains.values())
+
+    def mean(opened: Any) -> np.ndarray:
+        found: Any = policy.apply(opened, observed)
+        return np.asarray(found.mean)
+
     opened = jax.tree_util.tree_map_with_path(lambda path, leaf: leaf + 0.3 if "Gain" in str(path) else leaf, params)
-    assert not np.allclose(before, policy.apply(opened, observed).mean)
+    assert not np.allclose(mean(params), mean(opened))
 
 
 def test_features_of_a_dial_are_bells_over_its_range():

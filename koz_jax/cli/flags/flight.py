@@ -18,7 +18,6 @@ from koz_jax.config.shield import CERTAIN, ShieldConfig, UncertaintyConfig
 from koz_jax.config.spread import Urgency
 from koz_jax.config.task import ScenarioConfig, TaskConfig
 from koz_jax.control.registry import ADVERSARIAL, CLASSICAL
-from koz_jax.errors import SettingsError
 
 if TYPE_CHECKING:
     from koz_jax.control.base import TaskController
@@ -27,6 +26,10 @@ AGENTS = f"shipped agents by name ({', '.join(shipped_agents())}), folders of ru
 AGENT = (
     f"a shipped agent by name ({', '.join(shipped_agents())}), the folder of a run or of an agent, or a SAC zip of"
     " Stable-Baselines3"
+)
+URGENCY = (
+    "How much an agent for any spacecraft hurries, from 0 (thrifty) to 1 (as fast as the torque allows); by default"
+    " 0.5."
 )
 CONTROLLERS = (
     f"{', '.join(CLASSICAL)}; one that does its worst: {', '.join(ADVERSARIAL)}; or path/to/file.py:CLASS, a class of"
@@ -41,9 +44,7 @@ class AgentFlags(Settings):
     controller: str | None = Field(
         default=None, description=f"Fly this on the agent's task in place of the agent: {CONTROLLERS}."
     )
-    urgency: Urgency | None = None
-    """How much an agent hurries that listens to it, from 0 (thrifty) to 1 (as fast as the torque allows); by default
-    0.5."""
+    urgency: Urgency | None = Field(default=None, description=URGENCY)
 
     def load(self) -> TaskController:
         """Load who flies.
@@ -53,14 +54,13 @@ class AgentFlags(Settings):
 
         """
         from koz_jax.agents.agent import load_agent
+        from koz_jax.agents.flight import in_a_hurry
         from koz_jax.control.registry import load_controller
 
-        agent = load_agent(self.agent)
+        flying = load_agent(self.agent)
         if self.controller is not None:
-            if self.urgency is not None:
-                raise SettingsError(f"urgency: is of agents, and {self.controller} has none; got {self.urgency}")
-            return load_controller(self.controller, agent.task)
-        return agent if self.urgency is None else agent.with_urgency(self.urgency)
+            flying = load_controller(self.controller, flying.task)
+        return flying if self.urgency is None else in_a_hurry(flying, self.urgency)
 
 
 class _RuleFlags(Settings):

@@ -87,8 +87,8 @@ class BodyConfig(Table):
     """Largest torque about each body axis [N m]: one number for all, or one for each."""
     wheels: Annotated[None, _not_yet("allowed is torque_limit [N m], one number or three")] = None
     """Reaction wheels: not supported yet."""
-    max_rate_deg: Annotated[None, _not_yet("allowed is to leave it out: the rate is not limited")] = None
-    """Largest body rate [deg/s]: not supported yet."""
+    max_rate_deg: PositiveFloat | None = None
+    """Largest norm of the body rate [deg/s]; kept by agents for any spacecraft."""
 
     @model_validator(mode="after")
     def _physical(self) -> Self:
@@ -107,7 +107,12 @@ class BodyConfig(Table):
 
     def spacecraft(self, boresight: Vector) -> SpacecraftConfig:
         """The same with an instrument.  boresight: unit vector in body axes."""
-        return SpacecraftConfig(inertia=self.inertia, boresight=boresight, torque_limit=self.torque_limit)
+        return SpacecraftConfig(
+            inertia=self.inertia,
+            boresight=boresight,
+            torque_limit=self.torque_limit,
+            max_rate_deg=self.max_rate_deg,
+        )
 
     @property
     def half_turns(self) -> tuple[float, float]:

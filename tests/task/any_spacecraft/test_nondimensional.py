@@ -51,11 +51,11 @@ def test_the_observation_has_the_entries_that_are_declared():
 @pytest.mark.parametrize(("scale", "torque_scale"), [(1e-3, 1e-4), (1e3, 5.0)])
 def test_spacecraft_of_one_shape_look_alike_and_ask_for_the_same_share(scale, torque_scale):
     small, large = spacecraft(), spacecraft(scale, torque_scale)
-    seen = [nondimensional.observe(maneuver(model), model, 0.3) for model in (small, large)]
-    np.testing.assert_allclose(*seen, atol=1e-5)
+    seen, expected = (nondimensional.observe(maneuver(model), model, 0.3) for model in (small, large))
+    np.testing.assert_allclose(seen, expected, atol=1e-5)
     action = jnp.array([0.3, -0.9, 0.1])
-    shares = [nondimensional.command(action, maneuver(model), model) for model in (small, large)]
-    np.testing.assert_allclose(*shares, rtol=1e-5)
+    share, other = (nondimensional.command(action, maneuver(model), model) for model in (small, large))
+    np.testing.assert_allclose(share, other, rtol=1e-5)
 
 
 def test_a_turn_of_the_bodys_axes_that_keeps_the_policys_changes_nothing():
