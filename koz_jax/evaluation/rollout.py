@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from koz_jax.control.base import Controller, Memory
-from koz_jax.task import reward
+from koz_jax.task import reward, rotations
 from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.environment import Reorientation
 from koz_jax.task.reward import RewardTerms
@@ -28,6 +28,9 @@ class CaseResult(struct.PyTreeNode):
     mean_torque_change: jax.Array  # () [N m] mean norm of that change over all steps
     deadlocked: jax.Array  # () bool, not settled and the shield changed the torque in the last step
     unsafe_start: jax.Array  # () bool, in a zone at the start, or in a state from which the shield promises nothing
+    peak_rate: jax.Array  # () [rad/s] largest norm of the body rate
+    torque_variation: jax.Array  # () [N m] sum over steps and axes of how much the torque changes
+    unrest: jax.Array  # () mean squared action over the last fifth of the maneuver
 
     @property
     def reward(self) -> jax.Array:
@@ -68,6 +71,9 @@ class _Tally(struct.PyTreeNode):
     interventions: jax.Array  # () steps in which the shield changed the torque
     torque_change: jax.Array  # () [N m] sum of the norms of that change
     intervened: jax.Array  # () bool, in the last step
+    peak_rate: jax.Array
+    torque_variation: jax.Array
+    unrest: jax.Array
 
 
 def _take_off(env: Reorientation, controller: Controller, drawn: Scenario, key: jax.Array) -> _Flight:
@@ -116,6 +122,9 @@ def _first_tally(env: Reorientation, start: _Flight) -> _Tally:
         interventions=jnp.int32(0),
         torque_change=jnp.zeros(()),
         intervened=jnp.array(False),
+        peak_rate=rotations.norm(start.state.body.omega_BN_B),
+        torque_variation=jnp.zeros(()),
+        unrest=jnp.zeros(()),
     )
 
 
@@ -149,6 +158,7 @@ def run_case(
             interventions=tally.interventions + stepped.command.intervened,
             torque_change=tally.torque_change + jnp.linalg.norm(change_B),
             intervened=stepped.command.intervened,
+            **_agility(env, tally, stepped),
         ), None
 
     end, _ = jax.lax.scan(advance, _first_tally(env, start), None, length=env.episode_steps)
@@ -167,7 +177,27 @@ def run_case(
         mean_torque_change=end.torque_change / env.episode_steps,
         deadlocked=~settled & end.intervened,
         unsafe_start=~(env.covers(start.state) & (env.margin(start.state) > 0.0)),
+        peak_rate=end.peak_rate,
+        torque_variation=end.torque_variation,
+        unrest=end.unrest,
     )
+
+
+def _agility(env: Reorientation, tally: _Tally, stepped: Step) -> dict[str, jax.Array]:
+    """How fast the body turns, and how much the torque changes and is used at the end, after one more step."""
+    after, before = stepped.state, tally.flight.state
+    change_B = jnp.where(before.steps == 0, 0.0, jnp.abs(after.torque_B - before.torque_B))
+    last_fifth = after.steps > env.episode_steps - _last_steps(env)
+    return {
+        "peak_rate": jnp.maximum(tally.peak_rate, rotations.norm(after.body.omega_BN_B)),
+        "torque_variation": tally.torque_variation + jnp.sum(change_B),
+        "unrest": tally.unrest + jnp.where(last_fifth, jnp.mean(stepped.command.applied**2), 0.0) / _last_steps(env),
+    }
+
+
+def _last_steps(env: Reorientation) -> int:
+    """Steps of the last fifth of a maneuver."""
+    return max(env.episode_steps // 5, 1)
 
 
 def fly(env: Reorientation, controller: Controller, drawn: Scenario, key: jax.Array | None = None) -> History:

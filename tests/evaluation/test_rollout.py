@@ -10,8 +10,9 @@ from support import oracle
 from koz_jax.config.shield import ShieldConfig, UncertaintyConfig
 from koz_jax.config.task import RewardConfig, TaskConfig
 from koz_jax.control.base import Memoryless
+from koz_jax.control.registry import load_controller
 from koz_jax.control.shield.filter import under_shield
-from koz_jax.evaluation import rollout
+from koz_jax.evaluation import cases, rollout
 from koz_jax.evaluation.rollout import CaseResult, History
 from koz_jax.task import reward, scenario, uncertainty
 from koz_jax.task.dynamics import RigidBodyState
@@ -434,3 +435,17 @@ def test_a_start_inside_a_zone_is_named_an_unsafe_one_with_and_without_a_shield(
     np.testing.assert_array_equal(results.unsafe_start, inside)
     shielded = _run(IDLE, _cases()["out of a zone at the start"][1], under_shield(env, ShieldConfig()), 1)
     assert bool(shielded.unsafe_start)
+
+
+def test_agility_is_what_the_history_shows():
+    """Largest rate, total variation of the torque, and the squared action at the end, from the history in float64."""
+    agent = load_controller("pd")
+    drawn = scenario.paper_test()
+    short = TaskConfig(episode_seconds=5.0)
+    history, result = cases.fly_scenario(agent, drawn, short)
+    rates = np.linalg.norm(np.asarray(history.state.body.omega_BN_B, float), axis=1)
+    torques = np.asarray(history.state.torque_B[1:], float)
+    np.testing.assert_allclose(result.peak_rate, rates.max(), rtol=1e-5)
+    np.testing.assert_allclose(result.torque_variation, np.abs(np.diff(torques, axis=0)).sum(), rtol=1e-4)
+    np.testing.assert_allclose(result.unrest, np.mean((torques[-10:] / 2.0) ** 2), rtol=1e-4)
+    assert float(result.torque_variation) > 0.0 and float(result.unrest) > 0.0

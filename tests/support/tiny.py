@@ -194,8 +194,11 @@ def untrained_agent(seed: int = 0, network: NetworkConfig = CONFIG.network) -> A
 
 
 def unshielded(cases: int) -> dict[str, Any]:
-    """What the outcomes of so many cases say of a shield where there was none."""
+    """What the outcomes of so many cases say of a shield where there was none, and of agility where nothing moved."""
     return {
+        "peak_rate": np.zeros(cases, np.float32),
+        "torque_variation": np.zeros(cases, np.float32),
+        "unrest": np.zeros(cases, np.float32),
         "intervention_rate": np.zeros(cases, np.float32),
         "mean_torque_change": np.zeros(cases, np.float32),
         "deadlocked": np.zeros(cases, bool),
