@@ -2,8 +2,8 @@
 # # 4. Your spacecraft
 #
 # Another body, weaker actuators, a telescope that points elsewhere, larger zones: everything about the task is a
-# setting. This notebook makes a small satellite of its own, sees how the shipped agent fares on it, trains one for it,
-# and evaluates that.
+# setting. This notebook makes a small satellite of its own, flies it at once with the shipped agent for any spacecraft,
+# as fast and as thriftily as one likes, and then trains an agent for it alone.
 
 # %%
 from pathlib import Path
@@ -42,17 +42,23 @@ except ValidationError as error:
     print(error.errors()[0]["msg"])
 
 # %% [markdown]
-# ## The shipped agent on it
-# It was trained for another body and another telescope:
+# ## Without training
+# The agent `universal` flies any spacecraft. `with_urgency` trades effort for time, from 0 to 1:
 
 # %%
 cases = 2_000
-before = monte_carlo(load_agent("phase2"), cases=cases, task=mine)
-print(table(before, name="phase2 on my spacecraft"))
+universal = load_agent("universal")
+for urgency in (0.0, 0.5, 1.0):
+    hurried = monte_carlo(universal.with_urgency(urgency), cases=500, task=mine)
+    print(table(hurried, name=f"urgency {urgency}").splitlines()[3:5])
+
+# %%
+before = monte_carlo(universal, cases=cases, task=mine)
+print(table(before, name="universal"))
 
 # %% [markdown]
 # ## One of its own
-# The settings of notebook 2, with the new task.
+# The settings of notebook 2, with the new task. An agent for one spacecraft must be trained again for every change of it.
 
 # %%
 short = preset("short")
@@ -66,12 +72,13 @@ after = monte_carlo(agent, cases=cases)
 print(table(after, name="my agent"))
 
 # %% [markdown]
-# A training of two minutes is short: `preset("fast")` and `preset("thorough")` train longer. What is left of cases that
-# look into a zone is what the shield is for: `monte_carlo(agent, task=mine, shield=ShieldConfig())`.
+# A training of two minutes is short: `preset("fast")` and `preset("thorough")` train longer, `preset("universal")` trains
+# for all. What is left of cases that look into a zone is what the shield is for:
+# `monte_carlo(agent, task=mine, shield=ShieldConfig())`.
 
 # %%
 figure, (left, right) = plt.subplots(1, 2, layout="constrained")
-for name, flown in {"phase2": before, "my agent": after}.items():
+for name, flown in {"universal": before, "my agent": after}.items():
     left.hist(np.rad2deg(flown.results.min_margin), bins=np.arange(-40, 41, 2), histtype="step", label=name)
     right.hist(flown.results.settling_time, bins=np.arange(0, 101, 2.5), histtype="step", label=name)
 left.set(xlabel="smallest margin [°]", ylabel="cases")

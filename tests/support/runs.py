@@ -43,7 +43,8 @@ def assert_same_tree(found: Any, expected: Any) -> None:
     for (path, one), (_, other) in zip(
         jax.tree_util.tree_leaves_with_path(found), jax.tree_util.tree_leaves_with_path(expected), strict=True
     ):
-        if jax.dtypes.issubdtype(one.dtype, jax.dtypes.prng_key):  # pyright: ignore[reportPrivateImportUsage]
+        keys = isinstance(one, jax.Array) and jax.dtypes.issubdtype(one.dtype, jax.dtypes.prng_key)  # pyright: ignore
+        if keys:
             one, other = jax.random.key_data(one), jax.random.key_data(other)
         np.testing.assert_array_equal(one, other, err_msg=jax.tree_util.keystr(path), strict=True)
 
