@@ -58,7 +58,7 @@ print(table(before, name="universal"))
 
 # %% [markdown]
 # ## One of its own
-# The settings of notebook 2, with the new task. An agent for one spacecraft must be trained again for every change of it.
+# The settings of notebook 2, with the new task. Such an agent must be trained again for every change of the spacecraft.
 
 # %%
 short = preset("short")
@@ -72,8 +72,8 @@ after = monte_carlo(agent, cases=cases)
 print(table(after, name="my agent"))
 
 # %% [markdown]
-# A training of two minutes is short: `preset("fast")` and `preset("thorough")` train longer, `preset("universal")` trains
-# for all. What is left of cases that look into a zone is what the shield is for:
+# A training of two minutes is short: `preset("fast")` and `preset("thorough")` train longer, `preset("universal")` for
+# all spacecraft. What is left of cases that look into a zone is what the shield is for:
 # `monte_carlo(agent, task=mine, shield=ShieldConfig())`.
 
 # %%
