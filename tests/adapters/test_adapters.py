@@ -152,6 +152,7 @@ def flight(adapter, seed=SEED):
     return adapter(seed, random_actions())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adapter", ADAPTERS)
 def test_the_same_actions_give_what_the_core_gives(adapter):
     """Rewards, true final observations, first observations of the next episodes, and where episodes end."""
@@ -186,6 +187,7 @@ def test_a_seed_gives_the_same_flight_again_and_another_seed_another(adapter):
     assert np.abs(moved.rewards - flight(adapter).rewards).max() > 1e-2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [ReorientationEnv, ReorientationVectorEnv, lambda: ReorientationVecEnv(2)])
 def test_without_a_seed_every_environment_object_flies_something_else(make):
     def first(made):
@@ -210,6 +212,7 @@ def test_deviations_that_cannot_be_are_refused(make, options):
         make(**options)
 
 
+@pytest.mark.slow
 def test_every_adapter_shows_all_the_zones_that_a_scenario_can_have():
     several = TaskConfig(scenario=ScenarioConfig(max_zones=3))
     size = observation_layout.size(3)

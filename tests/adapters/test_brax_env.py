@@ -57,6 +57,7 @@ def test_every_key_draws_another_scenario():
     assert len(np.unique(np.asarray(observed), axis=0)) == 16
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [19, 20])
 def test_time_up_is_a_truncation_in_the_wrappers_of_brax_too(steps):
     wrapped = EpisodeWrapper(VmapWrapper(ENV), ENV.episode_steps, action_repeat=1)
@@ -72,6 +73,7 @@ def test_it_is_registered():
     assert isinstance(made, ReorientationEnv) and made.episode_steps == 20
 
 
+@pytest.mark.slow
 def test_episodes_shorter_than_the_maneuver_are_counted_from_each_reset():
     wrapped = wrap_for_training(ENV, episode_length=6, action_repeat=2)
     state: Any = wrapped.reset(jax.random.split(jax.random.PRNGKey(8), 2))

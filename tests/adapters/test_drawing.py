@@ -57,6 +57,7 @@ def test_the_trace_grows_where_the_telescope_looks():
     assert is_black(drawing.picture()).sum() > half_way.sum() + 300
 
 
+@pytest.mark.slow
 def test_an_environment_draws_what_it_flies():
     env = gymnasium.make(ENV_ID, task=TaskConfig(episode_seconds=6.0), render_mode="rgb_array")
     env.reset(options={"start": START, "zones": [ZONE], "rate_deg": (0.0, 0.0, -20.0)})
@@ -88,6 +89,7 @@ def test_another_mode_is_refused_by_name(mode):
         ReorientationVectorEnv(2, TASK, render_mode=mode)
 
 
+@pytest.mark.slow
 def test_a_film_is_recorded_in_the_time_of_the_maneuver(tmp_path, monkeypatch):
     """RecordVideo asks MoviePy for a film; here of what it is given."""
     films: list[tuple[int, list[np.ndarray]]] = []

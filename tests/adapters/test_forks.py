@@ -56,15 +56,18 @@ def said(code: str, *arguments: str) -> str:
     return done.stdout.strip() or done.stderr
 
 
+@pytest.mark.slow
 def test_processes_that_are_forked_before_jax_begins_fly_as_any_other():
     assert said(TOGETHER, "before") == "True"
 
 
+@pytest.mark.slow
 def test_processes_that_are_forked_later_are_refused_in_one_line_that_names_spawn():
     line = said(TOGETHER, "after")
     assert line.startswith("SettingsError: processes: must be spawned, not forked"), line
     assert 'vector_kwargs={"context": "spawn"}' in line and "\n" not in line
 
 
+@pytest.mark.slow
 def test_every_adapter_is_refused_in_a_fork():
     assert said(ALONE).split() == ["True"] * 3 + ["ended"]

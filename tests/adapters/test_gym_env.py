@@ -12,6 +12,7 @@ from koz_jax.adapters.gym_env import ENV_ID, ReorientationEnv, ReorientationVect
 from koz_jax.errors import SettingsError
 
 
+@pytest.mark.slow
 def test_gymnasium_finds_no_fault():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -33,6 +34,7 @@ def same(ours, theirs, where="info"):
             np.testing.assert_allclose(ours[name], theirs[name], rtol=1e-5, atol=2e-6, err_msg=f"{where}/{name}")
 
 
+@pytest.mark.slow
 def test_the_vector_environment_is_as_gymnasium_would_make_one_of_single_ones():
     ours = gymnasium.make_vec(ENV_ID, num_envs=3, task=TASK)
     singles = [lambda: gymnasium.make(ENV_ID, task=TASK, disable_env_checker=True)] * 3

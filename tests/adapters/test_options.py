@@ -32,6 +32,7 @@ def sb3(options: Any, seed: int | None = None) -> tuple[ReorientationVecEnv, np.
     return env, env.reset()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [OWN, {"scenario": koz_jax.maneuver(**OWN)}])
 def test_it_begins_where_it_is_told(options):
     single, many = ReorientationEnv(TASK), ReorientationVectorEnv(3, TASK)
@@ -40,6 +41,7 @@ def test_it_begins_where_it_is_told(options):
     np.testing.assert_allclose(sb3(options)[1], np.tile(expected(), (3, 1)), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_it_is_flown_as_the_monte_carlo_flies_it():
     """Without torque, to the end of the episode."""
     env = ReorientationEnv(TASK)
@@ -55,6 +57,7 @@ def test_it_is_flown_as_the_monte_carlo_flies_it():
     np.testing.assert_allclose(2 * np.rad2deg(turned), 2.0 * 0.1 * np.sqrt(2.0), rtol=0.05)
 
 
+@pytest.mark.slow
 def test_the_next_episode_is_drawn_again():
     env, plain = ReorientationEnv(TASK), ReorientationEnv(TASK)
     env.reset(seed=4, options=OWN)
@@ -87,6 +90,7 @@ def test_environments_without_options_fly_what_is_drawn():
     assert np.abs(after - expected()).max(axis=1).min() > 1e-2, "options are of one reset only"
 
 
+@pytest.mark.slow
 def test_fewer_zones_than_the_task_has_are_filled_up_and_the_boresight_is_its_own():
     task = TaskConfig(
         episode_seconds=2.0,

@@ -36,6 +36,7 @@ def test_environments_do_not_know_of_each_other():
             np.testing.assert_allclose(leaf[0], moved[0], rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_an_episode_is_judged_as_the_monte_carlo_judges_it():
     """Violated: in a zone at some step of the episode, whatever the margin is now.  Settled: now."""
 
@@ -102,6 +103,7 @@ def test_a_reset_without_seeds_goes_on_to_the_scenarios_that_autoreset_would_bri
     np.testing.assert_array_equal(by_hand.reset(), stepped.observation)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "task",
     [

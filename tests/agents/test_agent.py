@@ -162,6 +162,7 @@ def test_a_damaged_agent_is_refused(saved):
         load_agent(saved)
 
 
+@pytest.mark.slow
 def test_the_public_names_come_without_jax_until_they_are_used():
     code = (
         "import sys, koz_jax; assert 'jax' not in sys.modules\n"

@@ -83,6 +83,7 @@ MANEUVERS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("start", "target", "around", "settling_time"), MANEUVERS)
 def test_a_measured_quaternion_with_q0_above_0_flies_as_any_other(start, target, around, settling_time):
     """The plant is the oracle's, in float64; its q0 changes sign in mid-slew, that of the measurement never does."""

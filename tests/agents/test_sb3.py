@@ -55,6 +55,7 @@ def rewritten(path: Path, name: str, content: bytes) -> None:
             archive.writestr(entry, data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("net_arch", [[256, 256], [7], [], [5, 6, 7]])
 def test_it_decides_as_stable_baselines_does(net_arch, tmp_path):
     model = sac(net_arch=net_arch, activation_fn=torch.nn.ReLU)
@@ -148,6 +149,7 @@ def test_settings_that_cannot_be_read_are_refused(data, good, tmp_path):
         load_agent(path)
 
 
+@pytest.mark.slow
 def test_without_torch_it_says_what_to_install(good):
     code = (
         "import sys; sys.modules['torch'] = None\nfrom koz_jax.agents.agent import load_agent\n"
@@ -215,6 +217,7 @@ def written(found: dict[str, Any], folder: Path, kind: str) -> Any:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["mapping", "npz", "json"])
 def test_statistics_are_folded_into_the_first_layer(kind, normalized, tmp_path, caplog):
     path, model, env = normalized
@@ -254,6 +257,7 @@ def test_a_zip_that_does_not_tell_is_taken_with_a_caution(good, normalized, capl
         assert "does not tell whether its observations were normalised" in caplog.text
 
 
+@pytest.mark.slow
 def test_a_zip_that_was_trained_without_needs_no_statistics_and_takes_none(normalized, tmp_path, caplog):
     model = SAC("MlpPolicy", ReorientationVecEnv(2, SHORT), policy_kwargs={"net_arch": [8]}, buffer_size=50)
     model.learn(8)

@@ -35,6 +35,7 @@ def test_an_agent_knows_where_it_comes_from(name, phase):
     assert provenance.phase == phase
 
 
+@pytest.mark.slow
 def test_phase_1_flies_through_the_zone_of_the_papers_scenario_and_phase_2_around_it():
     _, through = cases.fly_scenario(load_agent("phase1"), scenario.paper_test())
     _, around = cases.fly_scenario(load_agent("phase2"), scenario.paper_test(), config=MonteCarloConfig(substeps=4))

@@ -181,6 +181,7 @@ def test_files_are_replaced_whole(agent, empty_cwd):
     assert json.loads((empty_cwd / "x.json").read_text())["cases"] == tiny.CASES
 
 
+@pytest.mark.slow
 def test_a_replayed_case_ends_like_its_row(capsys, run, empty_cwd):
     draw = ["--agent", run.path, "--cases", tiny.CASES, "--seed", 5]
     assert tiny.status("evaluate", *draw, "--csv", "all.csv") == 0

@@ -93,6 +93,7 @@ def test_messages_name_the_command_that_was_typed(monkeypatch, begun, train, vie
     assert invocation.typed("train", ["--run", "my run"]) == f"{train} --run 'my run'"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("begun", "named"),
     [(["eval_mc.py"], "python eval_mc.py"), (["-m", "koz_jax", "evaluate"], "python -m koz_jax evaluate")],
@@ -132,6 +133,7 @@ WITHOUT_MATPLOTLIB = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("argv", [["fly"], ["evaluate", "--figures", "out"], ["curves", "{run}", "--out", "out"]])
 def test_without_matplotlib_the_error_says_what_to_install(argv, tmp_path):
     run = metrics_log(tmp_path / "run")

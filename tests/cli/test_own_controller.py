@@ -89,6 +89,7 @@ def file(tmp_path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_it_is_flown_with_and_without_the_shield(file, agent, empty_cwd, capsys):
     argv = ["--agent", agent, "--controller", f"{file}:Mine", "--cases", tiny.CASES]
     assert tiny.status("evaluate", *argv, "--csv", "bare.csv") == 0
@@ -164,6 +165,7 @@ def python(file: Path, name: str) -> Any:
     return from_file._class(file, name)
 
 
+@pytest.mark.slow
 def test_in_python_a_controller_flies_as_it_is(file):
     """Without a name or a task it is called by its class, and flies the paper's task."""
     mine = python(file, "Mine")()

@@ -111,6 +111,7 @@ def test_bad_input_is_refused_by_name_before_anything_happens(capsys, monkeypatc
     assert list(empty_cwd.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_bad_settings_are_refused_before_jax_is_even_loaded(tmp_path):
     argvs = [argv.split() for argv, words in BAD if "resume" not in argv and "start-from" not in argv]
     code = (
@@ -322,6 +323,7 @@ def test_a_finished_run_is_evaluated_again(run, tmp_path, capsys, monkeypatch):
     assert files.read_json(RunFolder(tmp_path / "run").evaluation)["cases"] == tiny.CASES
 
 
+@pytest.mark.slow
 def test_a_resumed_run_keeps_the_cases_that_it_was_begun_with(run, tmp_path, capsys, monkeypatch):
     shutil.copytree(run.path, tmp_path / "run")
     folder = RunFolder(tmp_path / "run")

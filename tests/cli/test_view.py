@@ -28,6 +28,7 @@ def saved(tmp_path_factory):
     return str(folder)
 
 
+@pytest.mark.slow
 def test_command_draws_the_case_of_the_monte_carlo(saved, tmp_path, capsys):
     out = tmp_path / "maneuver.html"
     assert tiny.status("view", "--agent", saved, saved, "--case", 3, "--seed", 5, "--out", out) == 0

@@ -10,6 +10,7 @@ from koz_jax.control.attitude_path import AttitudePath
 MOMENTS = (60.0, 50.0, 70.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limits", [(2.0, 2.0, 2.0), (0.5, 1.0, 3.0)])
 def test_straight_turn_about_a_principal_axis_is_timed_as_bang_bang(limits):
     """Each axis by its own limit."""

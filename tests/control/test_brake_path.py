@@ -102,6 +102,7 @@ def test_braking_from_the_edge_of_the_safe_set_keeps_the_margin(shape, step):
     assert np.all(_smallest_margins(made, model, q, omega, axes, half_angles) >= float(made.margin) - 1e-5)
 
 
+@pytest.mark.slow
 def test_a_step_of_the_brake_that_is_longer_than_it_needs_is_counted():
     """A state of the paper's spacecraft at steps of 1 s that was called safe, and came 0.1 deg into the zone."""
     model = _model(oracle.INERTIA, 1.0)

@@ -31,6 +31,7 @@ CLASSICAL = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_actions_are_finite_and_in_the_box_everywhere(name):
     controller = PathPlanner(rounds=0) if name == "planner" else registry.load_controller(name).controller
@@ -61,6 +62,7 @@ def test_turning_the_inertial_frame_changes_nothing(controller):
     assert np.abs(before).max() > 0.5
 
 
+@pytest.mark.slow
 def test_zones_matter_to_all_but_pd():
     at = states.random_states(32, 23)
     absent = jax.tree.map(lambda leaf: jnp.stack([leaf] * 32), pointing_constraints.absent(3, states.LOOK))

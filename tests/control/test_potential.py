@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 from support.states import LOOK, MODEL, actions, random_states
 
@@ -29,6 +30,7 @@ def potential_value(vector_B, state, potential, look_B):
     return away * value
 
 
+@pytest.mark.slow
 def test_potential_torque_is_minus_the_gradient_and_damping():
     controller = PotentialFeedback(frequency=0.11)
     frequency = float(controller.frequency / units.of(MODEL).time)

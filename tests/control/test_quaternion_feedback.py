@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from support.states import MODEL, actions, random_states, state_of, states_of
 
 from koz_jax.control import feedback
@@ -12,6 +13,7 @@ from koz_jax.task.any_spacecraft import units
 from koz_jax.task.state import nominal, propagate
 
 
+@pytest.mark.slow
 def test_pd_rests_at_its_target():
     states = random_states(32, 3, rate=0.0)
     at_target = states.replace(body=states.body.replace(q_BN=states.scenario.q_DN))
@@ -21,6 +23,7 @@ def test_pd_rests_at_its_target():
     assert np.all(actions(QuaternionFeedback(), exact) == 0.0)
 
 
+@pytest.mark.slow
 def test_pd_brakes_in_time():
     """From half a turn away the error falls to the end without overshoot, where it counts on less torque than it has.
 

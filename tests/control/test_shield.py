@@ -89,6 +89,7 @@ def _brake_to_rest(bodies: RigidBodyState, zones: PointingConstraint) -> np.ndar
     return smallest
 
 
+@pytest.mark.slow
 @settings(max_examples=5, deadline=None)
 @given(seed=st.integers(0, 10**6), max_rate=st.sampled_from([0.05, 0.2, 0.5]))
 def test_braking_from_a_safe_state_keeps_the_margin(seed, max_rate):
@@ -181,6 +182,7 @@ def test_the_brake_takes_the_momentum_away_at_full_strength_and_then_rests():
     np.testing.assert_array_equal(brake(at_rest), 0.0)
 
 
+@pytest.mark.slow
 def test_a_start_is_flown_as_it_is_given_and_told_where_it_is_not_covered(env):
     bodies, zones = _states(7, 0.5)
     under = shield.under_shield(env, ShieldConfig())
@@ -243,6 +245,7 @@ def test_the_shipped_agent_flies_under_the_shield_as_it_does_without():
     assert not np.any(shielded.violated) and np.all(shielded.settled)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limit", [0.3, (0.3, 0.7, 1.9)])
 def test_an_action_that_passes_comes_back_to_the_last_bit_for_any_torque_limit(limit):
     task = TASK.model_copy(update={"spacecraft": SpacecraftConfig(torque_limit=limit)})
@@ -263,6 +266,7 @@ def test_no_settings_mean_no_shield(env):
 UNEQUAL = (0.5, 2.0, 1.2)
 
 
+@pytest.mark.slow
 @settings(max_examples=3, deadline=None)
 @given(seed=st.integers(0, 10**6))
 def test_what_is_let_through_is_inside_a_box_of_unequal_limits(seed):
@@ -374,6 +378,7 @@ def test_two_instruments_are_both_kept_out_of_their_zones(env, two_instruments, 
             assert np.all(margins > 0.0)
 
 
+@pytest.mark.slow
 def test_the_margin_of_a_flight_is_the_smaller_of_both_instruments(env, two_instruments):
     _, histories = _fly_all(env.replace(episode_steps=300), AnyAdversary.named("adversary"), two_instruments)
     body = histories.state.body.q_BN

@@ -85,6 +85,7 @@ def _scenario(inside_deg: float) -> Scenario:
     return Scenario(RigidBodyState(start, jnp.zeros(3)), jnp.eye(4)[0], zone)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inside_deg", [1.0, 0.06])
 def test_a_start_inside_a_zone_goes_out_by_the_shortest_way(inside_deg):
     """The telescope stayed on the Sun for 100 s.  The margin never falls below that of the start."""

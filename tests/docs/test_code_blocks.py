@@ -42,6 +42,7 @@ WITH_PYTHON = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", WITH_PYTHON)
 def test_python_blocks_run(page, tmp_path, monkeypatch):
     """One after another with the same names, in an empty folder."""

@@ -73,6 +73,7 @@ def test_a_scenario_is_its_index_and_its_seed():
     np.testing.assert_array_equal(other_neighbours.initial.q_BN[3], found.initial.q_BN[0])
 
 
+@pytest.mark.slow
 def test_cases_differ_and_seeds_differ():
     found = draws(0, 1, 2, 3, seed=0).initial.q_BN
     others = draws(0, 1, 2, 3, seed=1).initial.q_BN
@@ -234,6 +235,7 @@ def test_attitude_is_what_counts_not_its_sign():
         np.testing.assert_allclose(history.attitude_error, flown[0][0].attitude_error, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_direction_that_is_not_of_unit_length_is_never_a_false_safe():
     """The path crosses this zone: 19.9 deg inside, which an axis in km or zero used to hide."""
     crossing = maneuver.maneuver((0.5, 0.0, 0.0, 0.75**0.5), zones=[((0.5, 0.866, 0.0), 20.0)])

@@ -66,6 +66,7 @@ def test_its_own_task_or_an_easier_one_is_not_told(said):
     assert said() == []
 
 
+@pytest.mark.slow
 def test_flights_tell_it_once(said):
     other = changed(step_seconds=0.2)
     monte_carlo.run_cases(AGENT, other, MonteCarloConfig(cases=2), progress=False)

@@ -64,6 +64,7 @@ def test_every_constraint_has_its_own_boresight():
     np.testing.assert_allclose(np.rad2deg(drawn.constraints.half_angle), [20, 40, 20], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_without_constraints_there_is_one_that_is_absent():
     free = changed("calaon1", constraints=[], duration_seconds=1.0)
     assert not np.any(maneuver.scenario(free).constraints.is_present)
@@ -71,6 +72,7 @@ def test_without_constraints_there_is_one_that_is_absent():
     assert report["margins_deg"] == [] and report["min_margin_deg"] is None and not report["violated"]
 
 
+@pytest.mark.slow
 def test_the_report_has_these_keys_and_is_json():
     report = short().report()
     assert json.loads(json.dumps(report, allow_nan=False)) == report
@@ -107,6 +109,7 @@ def test_the_largest_rate_is_that_of_the_history():
     np.testing.assert_allclose(short().report()["peak_rate_deg"], rates.max(), rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("errors", [{}, {"inertia": 0.2, "disturbance_torque": 1e-4}])
 def test_between_the_steps_the_body_is_where_the_truth_takes_it(errors):
     """The last instant of a step, flown on by what is left of it, is the next step."""

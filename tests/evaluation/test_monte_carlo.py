@@ -182,6 +182,7 @@ def test_folders_that_are_not_for_blocks_are_refused(tmp_path):
         run_in_blocks(tmp_path / "used")
 
 
+@pytest.mark.slow
 def test_the_report_has_the_documented_keys_in_order():
     flown = monte_carlo.monte_carlo(AGENT, tiny.CASES, 3)
     summary = summarise(flown.results)
@@ -197,6 +198,7 @@ def test_the_report_has_the_documented_keys_in_order():
     assert json.loads(json.dumps(report, allow_nan=False)) == report
 
 
+@pytest.mark.slow
 def test_options_of_a_monte_carlo_are_those_of_its_settings():
     flown = monte_carlo.monte_carlo(AGENT, 5, 3, min_angle_deg=100.0, substeps=2)
     expected = MonteCarloConfig(cases=5, seed=3, min_angle_deg=100.0, substeps=2)
@@ -204,6 +206,7 @@ def test_options_of_a_monte_carlo_are_those_of_its_settings():
     assert_same(flown.results, cases.fly_cases(AGENT.controller, AGENT.task, expected))
 
 
+@pytest.mark.slow
 def test_another_task_than_the_agents_is_flown_when_asked_for():
     half = AGENT.task.with_rules("half")
     flown = monte_carlo.monte_carlo(AGENT, 5, 3, half)
@@ -337,6 +340,7 @@ def test_four_devices_give_the_results_of_one(single, tmp_path, monkeypatch):
     assert_same(jax.tree.map(np.asarray, archive.load_tree(tmp_path / "results", shapes)), single)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shield", [None, ShieldConfig()])
 def test_the_table_of_a_monte_carlo_knows_of_the_shield_and_of_the_task(shield):
     """Without being told: rows on the shield where one flew, the paper's numbers where the task is the paper's."""

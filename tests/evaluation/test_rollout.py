@@ -315,6 +315,7 @@ def test_half_convention_halves_the_accuracy_and_settles_no_later(env):
 # Between the steps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("substeps", "nearest"), [(1, 0.05), (2, 0.0), (3, 0.05 / 3)])
 def test_substeps_see_what_the_boresight_does_between_steps(env, substeps, nearest):
     """At 1 rad/s the boresight is at 0, 0.1, 0.2, ... rad; a zone of 0.02 rad at 0.25 rad lies between."""
@@ -324,6 +325,7 @@ def test_substeps_see_what_the_boresight_does_between_steps(env, substeps, neare
     assert bool(result.violated) == (nearest <= 0.02)
 
 
+@pytest.mark.slow
 def test_substeps_only_ever_find_a_smaller_margin_and_change_nothing_else(stacked, env, results):
     finer = _run_all(*stacked, env, STEPS, 3)
     assert np.all(finer.min_margin <= results.min_margin + 1e-6)
@@ -385,6 +387,7 @@ def test_what_the_shield_changed_is_counted_in_newton_metres():
     assert not bool(result.violated)
 
 
+@pytest.mark.slow
 def test_a_maneuver_with_errors_is_that_of_its_key(env):
     """The truth and the noise are drawn by the key: the same flight again, measured or recorded, and another else."""
     errors = UncertaintyConfig(inertia_error=0.1, disturbance_torque=0.02, attitude_noise_deg=0.1, rate_noise_deg=0.02)
@@ -430,6 +433,7 @@ def test_what_is_not_finite_is_never_a_success(controller, flown, env):
     assert np.isnan(result.settling_time)
 
 
+@pytest.mark.slow
 def test_a_start_inside_a_zone_is_named_an_unsafe_one_with_and_without_a_shield(results, env):
     inside = [name == "out of a zone at the start" for name in NAMES]
     np.testing.assert_array_equal(results.unsafe_start, inside)

@@ -63,6 +63,7 @@ def of_other_task(agent: Agent) -> Agent:
     return dataclasses.replace(agent, task=task.model_copy(update={"spacecraft": body, "scenario": scenario}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 @pytest.mark.parametrize("kind", ["plain", "robust", "unequal", "scaled"])
 def test_everything_compiles_without_a_warning(agent, folder, tmp_path, compiler, kind):
@@ -83,6 +84,7 @@ def test_nothing_is_left_to_be_filled_in(folder):
         assert not re.findall(r"@[A-Z_]+@", path.read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("program", ["koz_selftest", "koz_shield_selftest", "koz_example"])
 def test_sanitizers_find_nothing(folder, tmp_path, program):
     flags = ["-std=c99", "-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-DKOZ_WITH_SHIELD"]
@@ -128,6 +130,7 @@ def test_a_user_in_cpp(folder, tmp_path):
     assert run(tmp_path / "user").stdout == "1 1\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shield", [None, ShieldConfig()], ids=["alone", "shielded"])
 def test_the_example_flies_a_case(agent, folder, tmp_path, shield):
     if shield is None:
@@ -180,6 +183,7 @@ def fly(library: CLibrary, row: np.ndarray, measure, target_sign: float = 1.0) -
     return np.array(errors), np.concatenate(torques)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("measure", [as_it_is, from_a_star_tracker, now_and_then])
 @pytest.mark.parametrize(
     ("axis", "start", "target", "zone", "expected"),

@@ -156,6 +156,7 @@ def test_c_flown_in_the_loop_gets_the_same_verdicts(agent, flown, library):
     np.testing.assert_allclose(found.settling_time, flown.settling_time, rtol=0, atol=0.11)
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("hidden_sizes", [(), (5, 6, 7)])
 def test_c_of_other_networks(hidden_sizes, tmp_path):
@@ -299,6 +300,7 @@ def test_the_command_line(capsys, tmp_path):
         CLibrary(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("to", "missing"), [("onnx", "onnx"), ("stablehlo", "flatbuffers")])
 def test_a_missing_extra_says_what_to_install(to, missing, tmp_path):
     code = (

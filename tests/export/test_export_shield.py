@@ -91,6 +91,7 @@ def check_alike(agent: Agent, library: CLibrary, config: ShieldConfig = CONFIG) 
     assert np.all(np.abs(found) <= np.array(limits, np.float32))
 
 
+@pytest.mark.slow
 def test_it_decides_as_the_core_does(agent, library):
     check_alike(agent, library)
 
@@ -251,6 +252,7 @@ def test_the_command_line_asks_for_it(tmp_path, capsys):
         CLibrary(tmp_path / "c").shield(np.zeros((1, 15)), np.zeros((1, 3)))
 
 
+@pytest.mark.slow
 def test_the_command_line_asks_for_a_robust_one(tmp_path):
     tiny.untrained_agent().save(tmp_path / "agent")
     errors = {
@@ -271,6 +273,7 @@ def test_the_command_line_asks_for_a_robust_one(tmp_path):
     assert done.returncode == 0 and done.stdout.count("passed") == 2, done.stdout + done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", [CONFIG, ShieldConfig(error_bounds=UncertaintyConfig(inertia_error=0.05))])
 def test_its_self_test_passes_and_notices_another_margin(agent, tmp_path, config):
     write_files(tmp_path, export(agent, "c", config))
@@ -285,6 +288,7 @@ def test_its_self_test_passes_and_notices_another_margin(agent, tmp_path, config
     assert done.returncode != 0 and "FAILED" in done.stdout
 
 
+@pytest.mark.slow
 def test_a_shield_of_another_controller_is_not_compiled_in(agent, tmp_path):
     shield_of_phase1 = {name: text for name, text in export(agent, "c", CONFIG).items() if name in SHIELD_FILES}
     write_files(tmp_path, export(load_agent("zones3"), "c"))

@@ -57,6 +57,7 @@ def test_histories_are_in_the_units_on_their_axes():
     assert len(attitude.texts) == 1 and torque.get_ylim()[1] > 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("maneuver", [lambda: flown("phase2"), flown_cubesat])
 def test_the_turn_fills_its_panels_and_the_hold_has_its_own(maneuver):
     history, result, task = maneuver()
@@ -102,6 +103,7 @@ def test_no_numbers_of_an_axis_touch(maneuver):
     assert crowded_labels(histories.draw(*maneuver())) == []
 
 
+@pytest.mark.slow
 def test_several_zones_are_told_apart():
     history, _, task = flown_cubesat()
     axes = sphere.draw(history, task).axes[0]
@@ -117,6 +119,7 @@ def test_several_zones_are_told_apart():
         assert geometry.inside(there, zone), "a number stands in its own zone"
 
 
+@pytest.mark.slow
 def test_one_zone_needs_no_number():
     history, _, task = flown("phase2")
     assert not [text for text in sphere.draw(history, task).axes[0].texts if text.get_text().isdecimal()]

@@ -54,6 +54,7 @@ def _of_phase(config: CurriculumConfig, phase: int, points: int = 200) -> np.nda
     return np.linspace(first, last, points).astype(np.int32)
 
 
+@pytest.mark.slow
 def test_many_steps_at_once_equal_one_by_one():
     steps = np.concatenate([_of_phase(RAMPED, 1, 9), _of_phase(RAMPED, 2, 9), [99, 100, 400, 5000]])
     together = _at(RAMPED, jnp.array(steps))
@@ -105,6 +106,7 @@ def test_phase_two_begins_with_the_update_after_phase_one(config):
     np.testing.assert_array_equal(found["phase"], [1, 1, 2, 2])
 
 
+@pytest.mark.slow
 def test_after_the_end_the_last_difficulty_stays():
     end = RAMPED.updates
     found = _at(RAMPED, jnp.array([end, end + 1, 10 * end]))

@@ -58,6 +58,7 @@ def test_the_gradient_is_that_of_the_whole_maneuver(policy):
     np.testing.assert_allclose(jax.jit(jax.grad(along))(0.0), measured, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_the_gradient_is_finite_at_rest_on_the_target():
     start = ENV.reset(scenario.paper_test())
     at_rest = start.replace(
@@ -78,6 +79,7 @@ def test_refinement_lowers_the_cost_on_maneuvers_it_has_not_seen(policy):
     assert jax.jit(mean_cost)(refined.policy, keys) < 0.98 * jax.jit(mean_cost)(policy, keys)
 
 
+@pytest.mark.slow
 def test_chunks_of_any_length_are_one_refinement(policy):
     whole, parts = (refinement.init(CONFIG, jax.tree.map(jnp.copy, policy)) for _ in range(2))
     whole, _ = refinement.refine_chunk(CONFIG, whole, jnp.int32(5))

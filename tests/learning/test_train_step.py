@@ -24,6 +24,8 @@ from koz_jax.task import observation
 from koz_jax.task.environment import Reorientation
 from koz_jax.task.scenario import SamplingRule
 
+pytestmark = pytest.mark.slow
+
 # Everything small, and chosen so that within STEPS the ring wraps, episodes end and phase 2 begins.
 CONFIG = TrainConfig(
     task=TaskConfig(

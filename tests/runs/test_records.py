@@ -218,6 +218,7 @@ def test_an_agent_tells_how_much_refinement_was_tried(run):
     assert load_agent(run.agent("phase2-sac")).provenance.refinements_tried == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("better", [False, True])
 def test_a_refinement_that_gave_no_better_agent_says_so(run, tmp_path, monkeypatch, capsys, better):
     """Resumed at the beginning of the refinement, with evaluations that make every refined agent worse, or better."""

@@ -23,6 +23,7 @@ def test_a_used_folder_is_refused_and_stays_as_it_is(copied, tmp_path, no_comput
     assert tiny.contents(copied.path) == before
 
 
+@pytest.mark.slow
 def test_an_empty_folder_is_used(tmp_path, monkeypatch):
     monkeypatch.setattr(trainer._Run, "go", lambda *_: None)
     assert train(CONFIG, tmp_path, progress=False) is None
@@ -91,6 +92,7 @@ def test_two_trainers_do_not_share_a_folder(copied, no_compute):
     assert train(CONFIG, copied.path, resume=True, progress=False) is not None
 
 
+@pytest.mark.slow
 def test_a_run_too_large_for_memory_is_refused_in_numbers(tmp_path, no_compute):
     for fields, words in [
         ({"sac": {"buffer_size": 2**31 - 1}}, ["sac.buffer_size: must be smaller, got 2147483647", "GiB are free"]),
@@ -142,6 +144,7 @@ def test_a_source_that_does_not_fit_is_refused(run, tmp_path, no_compute, fields
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_source_with_too_few_steps_is_refused(run, tmp_path, no_compute):
     config = tiny.changed({"sac": {"n_step": 64}, "prefill_steps": 64})
     with pytest.raises(

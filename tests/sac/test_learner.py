@@ -208,6 +208,7 @@ def assert_close(found, expected, **tolerance):
         np.testing.assert_allclose(leaf, wanted, **tolerance, err_msg=jax.tree_util.keystr(path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("part", PARTS)
 def test_update_is_that_of_the_reference(part, seed):

@@ -52,6 +52,7 @@ def test_init_takes_shapes_and_types_and_holds_nothing():
         assert leaf.shape == (5, *example.shape) and leaf.dtype == example.dtype
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(steps=st.sampled_from([1, 2, 5]), inserted=st.integers(0, 15))
 def test_ring_holds_exactly_the_newest_rows(steps, inserted):

@@ -226,6 +226,7 @@ def step(env: Reorientation, state: EnvState, action: jax.Array) -> Step:
     return env.step(state, action)
 
 
+@pytest.mark.slow
 def test_a_step_is_a_pure_function(start, env):
     action = jnp.array([0.5, -0.2, 0.1])
     first = step(env, start, action)
@@ -265,6 +266,7 @@ def test_the_truth_flies_and_the_model_does_not_know(start, env):
     assert np.max(np.abs(flown.state.body.omega_BN_B - plain.state.body.omega_BN_B)) > 1e-4
 
 
+@pytest.mark.slow
 def test_one_trace_serves_every_spacecraft_and_scenario(setting):
     traces = []
 
@@ -330,6 +332,7 @@ def test_the_gradient_passes_the_filter_as_if_it_were_not_there(start, filtered)
     np.testing.assert_array_equal(clipped, [0.0, -2.0, 3.0])
 
 
+@pytest.mark.slow
 def test_the_gradient_of_a_step_is_that_of_the_torque_that_was_let_through(start, filtered, env):
     """A filter that halves the action: the step's slope is the one that the free step has at the halved action."""
 
@@ -343,6 +346,7 @@ def test_the_gradient_of_a_step_is_that_of_the_torque_that_was_let_through(start
     np.testing.assert_allclose(found, expected, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_filter_knows_what_is_measured_and_not_what_is(start, env):
     class Turn(struct.PyTreeNode):
         """Asks for the rate that it is shown."""
@@ -369,6 +373,7 @@ def short() -> Reorientation:
     return Reorientation.from_config(SHORT)
 
 
+@pytest.mark.slow
 def test_a_reset_by_key_is_the_reset_of_what_the_key_draws(short):
     key = jax.random.key(3)
     by_key, by_scenario = jax.jit(lambda env: (env.reset(key), env.reset(env.sample(key))))(short)
@@ -385,6 +390,7 @@ def test_a_reset_begins_where_its_scenario_says(short):
     np.testing.assert_allclose(state.q_e0_previous, 0.6428, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_reset_draws_what_the_environment_says():
     task = TaskConfig(scenario=ScenarioConfig(max_zones=3, min_half_angle_deg=5.0, max_half_angle_deg=6.0))
     env = Reorientation.from_config(task, 100.0, 110.0)
@@ -433,6 +439,7 @@ def step_all(env: Reorientation, states: EnvState, actions: jax.Array) -> Step:
     return jax.vmap(env.step)(states, actions)
 
 
+@pytest.mark.slow
 def test_a_step_with_autoreset_is_a_step_and_a_reset_where_time_is_up(short):
     keys = jax.random.split(jax.random.key(1), ENVS)
     states = reset_all(short, jax.random.split(jax.random.key(0), ENVS))
@@ -461,6 +468,7 @@ def test_a_step_with_autoreset_is_a_step_and_a_reset_where_time_is_up(short):
     assert np.all(np.abs(found.observation - found.final_observation)[over].max(axis=1) > 0.01)
 
 
+@pytest.mark.slow
 def test_where_no_episode_ends_nothing_is_drawn(short):
     states = reset_all(short, jax.random.split(jax.random.key(0), ENVS))
     found = step_autoreset(short, states, jnp.zeros((ENVS, 3)), jax.random.split(jax.random.key(1), ENVS))
@@ -469,6 +477,7 @@ def test_where_no_episode_ends_nothing_is_drawn(short):
     jax.tree.map(np.testing.assert_array_equal, found.state.scenario, states.scenario)
 
 
+@pytest.mark.slow
 def test_autoreset_brings_fresh_scenarios_of_the_range_for_ever(short):
     """Twelve episodes of four environments: 48 starts, no two alike, all as the ranges say."""
 

@@ -132,6 +132,7 @@ def test_what_is_no_scenario_is_refused():
         maneuver.checked(anything)
 
 
+@pytest.mark.slow
 def test_a_drawn_scenario_stays_bit_for_bit_as_it_is():
     env = Reorientation.from_config(TaskConfig.model_validate({"scenario": {"max_zones": 3}}))
     draws = jax.jit(jax.vmap(env.sample))(jax.random.split(jax.random.key(0), 50))

@@ -41,6 +41,7 @@ attitudes, directions, vectors = _units(4), _units(3), _vectors(3)
 turns = st.floats(0.0, 6.25, width=32)
 
 
+@pytest.mark.slow
 @given(attitudes, attitudes, attitudes)
 def test_product_is_associative(a, b, c):
     np.testing.assert_allclose(multiply(multiply(a, b), c), multiply(a, multiply(b, c)), atol=ATOL)

@@ -78,6 +78,7 @@ def test_deviation_axis_is_uniform_on_the_sphere(shrunk, component):
     assert stats.kstest(axis[:, component], stats.uniform(-1.0, 2.0).cdf).pvalue > UNLIKELY
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", ["shrunk", "resampled"])
 def test_attitude_is_a_unit_quaternion_with_non_negative_scalar_part(rule, request):
     q = request.getfixturevalue(rule).initial.q_BN
@@ -85,6 +86,7 @@ def test_attitude_is_a_unit_quaternion_with_non_negative_scalar_part(rule, reque
     np.testing.assert_allclose(np.linalg.norm(q.astype(np.float64), axis=1), 1.0, atol=3e-7)
 
 
+@pytest.mark.slow
 def test_half_a_turn_has_no_scalar_part():
     drawn = _draw(_ranges(180.0, 180.0), RESAMPLE)
     # float32(pi) is above pi, so the rounded value may be one ulp of 1 below zero.
@@ -171,6 +173,7 @@ def test_resample_is_the_plain_distribution_given_that_the_zone_fits(resampled):
         assert pvalue > UNLIKELY
 
 
+@pytest.mark.slow
 def test_resample_that_gives_up_still_keeps_the_separation_or_leaves_the_zone_out():
     drawn = _draw(_ranges(20.0, 60.0), SamplingRule("resample", max_draws=2))
     half_angle, room = _half_angle_deg(drawn), _room_deg(drawn)
@@ -182,6 +185,7 @@ def test_resample_that_gives_up_still_keeps_the_separation_or_leaves_the_zone_ou
     assert np.all(room[~zone] < 17.0 + 1e-4)
 
 
+@pytest.mark.slow
 def test_resample_that_keeps_the_angle_leaves_the_deviations_as_the_range_says():
     """Drawing them again favours large ones, also where no zone fits at all."""
     drawn = _draw(_ranges(20.0, 180.0), SamplingRule("resample", max_draws=8, keep_angle=True))
@@ -219,6 +223,7 @@ def test_shrink_draws_the_half_angle_uniformly_up_to_what_fits(shrunk):
     assert stats.kstest(share, stats.uniform().cdf).pvalue > UNLIKELY
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", [RESAMPLE, SHRINK], ids=["resample", "shrink"])
 def test_a_key_gives_the_same_scenario_alone_and_among_others(rule):
     sample = functools.partial(scenario.sample, ranges=_ranges(80.0, 180.0), rule=rule)

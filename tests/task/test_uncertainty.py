@@ -34,6 +34,7 @@ def test_the_disturbance_has_its_norm_and_any_direction(errors, env):
     assert np.max(np.abs(disturbance.mean(axis=0))) < 0.05 * 4 * 0.58 / np.sqrt(2000)
 
 
+@pytest.mark.slow
 def test_noise_has_its_size_and_its_bound_and_spares_the_rest(errors, env):
     state = env.reset(scenario.paper_test())
     seen = jax.vmap(lambda key: uncertainty.add_sensor_noise(errors, state, key))(KEYS)

@@ -185,6 +185,7 @@ def test_trail_is_marked_where_it_is_inside(content):
         np.testing.assert_array_equal(trail["line"]["color"], inside)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("half_angles_deg", [(), (20.0, 35.0), (120.0,)])
 def test_any_number_of_zones(agents, half_angles_deg):
     axes = jnp.eye(3)[: max(len(half_angles_deg), 1)]
@@ -245,6 +246,7 @@ def test_body_turns_with_the_attitude(content):
     assert turning.keys() <= set(names)
 
 
+@pytest.mark.slow
 def test_the_maneuver_under_the_shield_is_another_one(agents, flown):
     config = MonteCarloConfig(shield=ShieldConfig(margin_deg=60.0))
     shielded = fly(agents[0], PAPER, "shielded", config=config)
@@ -273,6 +275,7 @@ def test_no_page_without_maneuvers():
         page.render([], "nothing")
 
 
+@pytest.mark.slow
 def test_the_page_needs_no_matplotlib():
     code = "import sys; sys.modules['matplotlib'] = None; import koz_jax.viewer.page"
     assert tiny.run_python("-c", code).returncode == 0

@@ -42,6 +42,7 @@ def maneuver(model: Model, rate: float = 0.3) -> EnvState:
     return state.begin(Scenario(body, target, zones), model)
 
 
+@pytest.mark.slow
 def test_the_observation_has_the_entries_that_are_declared():
     seen = nondimensional.observe(maneuver(spacecraft()), spacecraft(), 0.5, zones=2)
     assert seen.shape == (size(2, scaled=True),) == (sum(layout(2, scaled=True).values()),)
