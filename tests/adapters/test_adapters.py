@@ -160,6 +160,7 @@ def test_the_same_actions_give_what_the_core_gives(adapter):
         np.testing.assert_allclose(ours, expected, rtol=1e-5, atol=2e-6, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adapter", ADAPTERS)
 def test_every_episode_of_every_environment_has_a_new_scenario(adapter):
     starts = flight(adapter).acted_on[[0, EPISODE, 2 * EPISODE]].reshape(-1, observation_layout.SIZE)

@@ -32,6 +32,7 @@ def test_import_is_silent():
     assert done.stdout == ""
 
 
+@pytest.mark.slow
 def test_rewards_and_observations_are_those_of_the_core():
     env = Reorientation.from_config(TASK)
     step = jax.jit(env.step)
@@ -52,6 +53,7 @@ def test_typed_and_raw_keys_draw_the_same_scenario():
     np.testing.assert_array_equal(ENV.reset(key).obs, ENV.reset(jax.random.key_data(key)).obs)
 
 
+@pytest.mark.slow
 def test_every_key_draws_another_scenario():
     observed = jax.jit(jax.vmap(lambda key: ENV.reset(key).obs))(jax.random.split(jax.random.key(6), 16))
     assert len(np.unique(np.asarray(observed), axis=0)) == 16

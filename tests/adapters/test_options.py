@@ -72,6 +72,7 @@ def test_the_next_episode_is_drawn_again():
     np.testing.assert_allclose(observed[0], single.reset()[0], rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_given_maneuver_after_the_end_of_an_episode_is_flown():
     env = ReorientationEnv(TASK)
     env.reset(seed=4)
@@ -80,6 +81,7 @@ def test_a_given_maneuver_after_the_end_of_an_episode_is_flown():
     np.testing.assert_allclose(env.reset(options=OWN)[0], expected(), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_environments_without_options_fly_what_is_drawn():
     _, observed = sb3([OWN, {}, {}], seed=7)
     _, plain = sb3(None, seed=7)

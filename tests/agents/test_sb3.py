@@ -268,6 +268,7 @@ def test_a_zip_that_was_trained_without_needs_no_statistics_and_takes_none(norma
         load_agent(path, SHORT, statistics(normalized[2]))
 
 
+@pytest.mark.slow
 def test_rewards_alone_may_be_normalised(tmp_path, caplog):
     env = VecNormalize(ReorientationVecEnv(2, SHORT), norm_obs=False)
     model = SAC("MlpPolicy", env, policy_kwargs={"net_arch": [8]}, buffer_size=50)

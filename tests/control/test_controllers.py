@@ -41,6 +41,7 @@ def test_actions_are_finite_and_in_the_box_everywhere(name):
         assert np.all(np.abs(found) <= 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("controller", CLASSICAL, ids=registry.CLASSICAL)
 def test_turning_the_inertial_frame_changes_nothing(controller):
     at = states.random_states(32, 11)

@@ -48,6 +48,7 @@ def test_pd_brakes_in_time():
     assert np.all(about[:, -1] < 1e-3)
 
 
+@pytest.mark.slow
 def test_pd_without_saturation_has_a_lyapunov_function():
     """V = |e|^2 + |w + k e|^2 / (k r) falls along every motion; e: error vector, k, r: the two bandwidths."""
     controller = QuaternionFeedback(bandwidth=5.5, rate_bandwidth=16.5)

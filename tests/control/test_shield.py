@@ -112,6 +112,7 @@ def test_the_oracle_of_many_states_is_the_one_of_one_state():
             np.testing.assert_allclose(many[i], one, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_states_of_these_tests_are_both_safe_and_not():
     shares = [np.asarray(_safe(*_states(seed, 0.2))).mean() for seed in range(5)]
     assert 0.2 < np.mean(shares) < 0.8
@@ -139,6 +140,7 @@ def test_what_passes_leads_to_a_safe_state_or_is_the_brake(seed):
     assert np.all(braked | np.asarray(safe) | ~fast | inside)
 
 
+@pytest.mark.slow
 def test_a_request_that_leads_to_a_safe_state_passes_to_the_last_bit():
     bodies, zones = _states(3, 0.02)
     far = zones.replace(axis_N=-zones.axis_N)

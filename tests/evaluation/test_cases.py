@@ -61,6 +61,7 @@ def draws(*indices: int, **options: Any) -> Scenario:
     return together(MonteCarloConfig(cases=CASES, **options), jnp.array(indices))
 
 
+@pytest.mark.slow
 def test_a_scenario_is_its_index_and_its_seed():
     indices = (0, 7, 11, 123_456)
     found = draws(*indices, seed=SEED)
@@ -153,6 +154,7 @@ def test_other_seeds_ranges_and_weights_do_not_compile_again(flown, monkeypatch)
     assert len({float(run.initial_angle[0]) for run in again}) == 3
 
 
+@pytest.mark.slow
 def test_the_range_of_deviations_is_kept(flown):
     degrees = np.rad2deg(flown.initial_angle)
     assert np.all((degrees > 80) & (degrees < 180))
@@ -252,6 +254,7 @@ def test_a_direction_that_is_not_of_unit_length_is_never_a_false_safe():
 ANY_SPACECRAFT = TaskConfig(episode_seconds=2.0, spread=SpreadConfig(spacecraft=True, step_shares=(0.02, 0.04)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shield", [None, ShieldConfig()])
 def test_a_case_of_another_spacecraft_is_flown_again_with_that_spacecraft(shield):
     config = MonteCarloConfig(cases=3, seed=SEED, shield=shield)

@@ -93,6 +93,7 @@ def test_the_report_has_these_keys_and_is_json():
     assert report["peak_wheel_momentum_share"] is None
 
 
+@pytest.mark.slow
 def test_margins_are_of_each_constraint_in_the_order_of_the_file():
     """Against a float64 count over the history's own attitudes: between the steps they can only be smaller."""
     flown = short()
@@ -141,13 +142,19 @@ def test_a_rate_at_the_start_is_flown():
 # --- who flies ---
 
 
-def test_nobody_flies_another_spacecraft_by_default():
-    with pytest.raises(SettingsError) as refused:
-        koz_jax.fly(EXAMPLES["cubesat_6u"])
-    told = str(refused.value)
-    assert len(told.splitlines()) == 1 and "--controller planner --shield" in told
-    assert told.startswith("agent: phase2, which flies by default, was not made for '6U CubeSat, past the Sun' (")
+def test_by_default_an_agent_flies_that_was_made_for_the_spacecraft():
+    cubesat = EXAMPLES["cubesat_6u"]
     assert load_for(PAPER).name == "phase2"
+    assert load_for(cubesat).name == "universal"
+    assert load_for(PAPER, urgency=0.2).name == "universal"  # which listens to it
+    with pytest.raises(SettingsError, match="urgency: is of agents, and pd has none; got 0.5"):
+        load_for(cubesat, "pd", urgency=0.5)
+
+
+@pytest.mark.slow
+def test_the_agent_for_any_spacecraft_flies_the_examples_with_one_instrument():
+    flown = koz_jax.fly(EXAMPLES["cubesat_6u"])
+    assert flown.result.success
 
 
 @pytest.mark.parametrize(

@@ -142,6 +142,7 @@ def test_a_damaged_block_is_named_and_flown_again(single, tmp_path, caplog):
     assert "damaged" not in caplog.text
 
 
+@pytest.mark.slow
 def test_blocks_of_another_flight_are_refused(tmp_path, monkeypatch):
     folder = tmp_path / "block-0000000000"
     run_in_blocks(tmp_path, cases=BLOCK)

@@ -48,6 +48,7 @@ def test_a_maneuver_of_nothing_has_a_path_of_one_point():
     np.testing.assert_allclose(geometry.shortest_path(attitude, attitude, BORESIGHT_B), [BORESIGHT_B] * 201, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("agent, enters", [("phase1", True), ("phase2", False)])
 def test_the_trace_of_phase_1_enters_the_zone_and_that_of_phase_2_does_not(agent, enters):
     history, _, _ = flown(agent)

@@ -116,6 +116,7 @@ def test_learning_curves_are_written(tmp_path, capsys):
     assert "learning.png" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_columns_are_those_that_a_training_writes():
     written = (tiny.finished_run().path / "metrics.csv").read_text().splitlines()[0].split(",")
     assert {*learning.COLUMNS} <= {*written}

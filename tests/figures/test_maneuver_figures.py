@@ -16,6 +16,7 @@ from koz_jax.task.scenario import Scenario
 TASK = tiny.CONFIG.task
 
 
+@pytest.mark.slow
 def test_the_zone_on_the_page_has_the_true_radius():
     history, _, task = flown()
     traces = geometry.sphere_traces(history)
@@ -90,6 +91,7 @@ def test_a_maneuver_that_does_not_settle_is_drawn_whole():
     assert histories.draw(history, early, task).axes[0].get_xlim() == pytest.approx((0.0, 1.0))
 
 
+@pytest.mark.slow
 def test_torques_of_a_cubesat_are_in_millinewtons():
     history, result, task = flown_cubesat()
     torque = histories.draw(history, result, task).axes[2]
