@@ -59,14 +59,18 @@ def load_for(
         SettingsError: as of ``fly``.
 
     """
-    if isinstance(agent, str) and (agent in BUILT_IN or ".py:" in agent):
-        return load_controller(agent, maneuver.task)
-    if agent is None:
-        agent = load_agent(DEFAULT_AGENT)
-        if urgency is not None or maneuvers.unfamiliar(agent, maneuver):
-            agent = load_agent(DEFAULT_FOR_OTHERS)
-    flying = load_agent(agent) if isinstance(agent, Path | str) else agent
+    flying = _named(maneuver, agent) if isinstance(agent, Path | str) else agent
+    if flying is None:
+        flying = load_agent(DEFAULT_AGENT)
+        if urgency is not None or maneuvers.unfamiliar(flying, maneuver):
+            flying = load_agent(DEFAULT_FOR_OTHERS)
     return flying if urgency is None else in_a_hurry(flying, urgency)
+
+
+def _named(maneuver: ManeuverConfig, name: Path | str) -> TaskController:
+    if isinstance(name, str) and (name in BUILT_IN or ".py:" in name):
+        return load_controller(name, maneuver.task)
+    return load_agent(name)
 
 
 def in_a_hurry(flying: TaskController, urgency: float) -> TaskController:

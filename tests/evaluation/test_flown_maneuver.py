@@ -147,7 +147,7 @@ def test_by_default_an_agent_flies_that_was_made_for_the_spacecraft():
     assert load_for(PAPER).name == "phase2"
     assert load_for(cubesat).name == "universal"
     assert load_for(PAPER, urgency=0.2).name == "universal"  # which listens to it
-    with pytest.raises(SettingsError, match="urgency: is of agents, and pd has none; got 0.5"):
+    with pytest.raises(SettingsError, match=r"urgency: is of agents, and pd has none; got 0\.5"):
         load_for(cubesat, "pd", urgency=0.5)
 
 
