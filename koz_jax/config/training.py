@@ -153,7 +153,7 @@ class TrainConfig(Settings):
     """One training run."""
 
     preset: str = "custom"
-    """Settings to begin from: fast, thorough or paper; every other flag changes one of them."""
+    """Settings to begin from: fast, thorough, universal or paper; every other flag changes one of them."""
     task: TaskConfig = TaskConfig()
     """What is learned."""
     network: NetworkConfig = NetworkConfig()
