@@ -135,20 +135,17 @@ def run_case(
 
     Args:
         env: what is flown, for its ``episode_steps``.
-        controller: who flies.
-        drawn: the maneuver.
+        controller, drawn: who flies, and which maneuver.
         substeps: the zone is checked at so many instants per step; 1 checks at the steps only.
         key: () typed PRNG key of what is random in the controller and in the truth.
     """
     start = _take_off(env, controller, drawn, jax.random.key(0) if key is None else key)
-    limits = env.nominal_limits
 
     def advance(tally: _Tally, _: None) -> tuple[_Tally, None]:
         flight, stepped = _step(env, controller, tally.flight)
         margin = stepped.outcome.zone_margin
         if substeps > 1:
             margin = jnp.minimum(margin, _margin_between(env, tally.flight, stepped.state.torque_B, substeps))
-        change_B = limits.box_B * stepped.command.change
         return _Tally(
             flight=flight,
             reward_terms=jax.tree.map(jnp.add, tally.reward_terms, stepped.terms),
@@ -156,7 +153,7 @@ def run_case(
             min_margin=jnp.minimum(tally.min_margin, margin),
             last_unsettled=_last_unsettled(env, stepped.state, tally.last_unsettled),
             interventions=tally.interventions + stepped.command.intervened,
-            torque_change=tally.torque_change + jnp.linalg.norm(change_B),
+            torque_change=tally.torque_change + jnp.linalg.norm(env.nominal_limits.box_B * stepped.command.change),
             intervened=stepped.command.intervened,
             **_agility(env, tally, stepped),
         ), None

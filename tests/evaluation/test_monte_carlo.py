@@ -50,6 +50,8 @@ REPORT_KEYS = [
     "mean_torque_change",
     "deadlock_rate",
     "unsafe_start_rate",
+    "settling_time_scaled_mean",
+    "control_effort_scaled_mean",
     "compile_s",
     "wall_s",
 ]
