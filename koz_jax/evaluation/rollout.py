@@ -97,11 +97,12 @@ def _step(env: Reorientation, controller: Controller, flight: _Flight) -> tuple[
     return flight.replace(state=stepped.state, memory=memory), stepped
 
 
-def _margin_between(env: Reorientation, before: _Flight, torque_B: jax.Array, substeps: int) -> jax.Array:
-    """Smallest margin at ``substeps - 1`` instants inside the step that starts here.  Returns () [rad]."""
-    margins = [jnp.float32(jnp.inf)]
+def _smallest_margin(env: Reorientation, before: _Flight, stepped: Step, substeps: int) -> jax.Array:
+    """Smallest margin of a step: at its end, and at ``substeps - 1`` instants inside it.  Returns () [rad]."""
+    margins = [stepped.outcome.zone_margin]
     for i in range(1, substeps):
-        body = propagate(before.state.body, torque_B, before.truth, env.model.dt * (i / substeps))
+        seconds = env.model.dt * (i / substeps)
+        body = propagate(before.state.body, stepped.state.torque_B, before.truth, seconds)
         margins.append(env.margin(before.state.replace(body=body)))
     return jnp.min(jnp.stack(margins))
 
@@ -135,7 +136,8 @@ def run_case(
 
     Args:
         env: what is flown, for its ``episode_steps``.
-        controller, drawn: who flies, and which maneuver.
+        controller: who flies.
+        drawn: the maneuver.
         substeps: the zone is checked at so many instants per step; 1 checks at the steps only.
         key: () typed PRNG key of what is random in the controller and in the truth.
     """
@@ -143,9 +145,7 @@ def run_case(
 
     def advance(tally: _Tally, _: None) -> tuple[_Tally, None]:
         flight, stepped = _step(env, controller, tally.flight)
-        margin = stepped.outcome.zone_margin
-        if substeps > 1:
-            margin = jnp.minimum(margin, _margin_between(env, tally.flight, stepped.state.torque_B, substeps))
+        margin = _smallest_margin(env, tally.flight, stepped, substeps)
         return _Tally(
             flight=flight,
             reward_terms=jax.tree.map(jnp.add, tally.reward_terms, stepped.terms),
