@@ -97,22 +97,18 @@ def main(argv: list[str]) -> int:
 def _fly_all(args: argparse.Namespace, argv: list[str]) -> int:
     runtime.configure()
     agent = load_agent(args.agent)
-    lines = [_row(list(COLUMNS)), _row(["---"] * len(COLUMNS))]
+    lines = [stamp.row(list(COLUMNS)), stamp.row(["---"] * len(COLUMNS))]
     print("\n".join(lines))
     for trial in trials():
         shield, substeps = (ShieldConfig(), 5) if trial.shielded else (None, 1)
         config = MonteCarloConfig(cases=args.cases, seed=args.seed, shield=shield, substeps=substeps)
         for urgency in trial.urgencies:
             results = fly_cases(agent.with_urgency(urgency).controller, trial.task, config)
-            lines.append(_row(cells(trial, urgency, results)))
+            lines.append(stamp.row(cells(trial, urgency, results)))
             print(lines[-1], flush=True)
     if args.markdown:
         stamp.write_table(args.markdown, ["benchmarks/any_spacecraft.py", *argv], "\n".join(lines))
     return 0
-
-
-def _row(cells: list[str]) -> str:
-    return f"| {' | '.join(cells)} |"
 
 
 if __name__ == "__main__":

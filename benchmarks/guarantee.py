@@ -124,21 +124,17 @@ def main(argv: list[str]) -> int:
 
 def _try_all(args: argparse.Namespace, argv: list[str]) -> int:
     runtime.configure()
-    lines = [_row(list(COLUMNS)), _row(["---"] * len(COLUMNS))]
+    lines = [stamp.row(list(COLUMNS)), stamp.row(["---"] * len(COLUMNS))]
     print("\n".join(lines))
     for trial in trials():
         if args.only and not any(word in trial.title for word in args.only):
             continue
         for name in trial.controllers:
-            lines.append(_row(fly(name, trial, args.scale)))
+            lines.append(stamp.row(fly(name, trial, args.scale)))
             print(lines[-1], flush=True)
     if args.markdown:
         stamp.write_table(args.markdown, ["benchmarks/guarantee.py", *argv], "\n".join(lines))
     return 0
-
-
-def _row(cells: list[str]) -> str:
-    return f"| {' | '.join(cells)} |"
 
 
 if __name__ == "__main__":

@@ -22,6 +22,11 @@ def write_table(path: Path, argv: list[str], table: str) -> None:
     files.write_text(path, f"<!-- made by a command, see below; do not edit -->\n{head}\n\n{table}\n")
 
 
+def row(cells: list[str]) -> str:
+    """A row of a Markdown table."""
+    return f"| {' | '.join(cells)} |"
+
+
 def commit() -> str:
     """Abbreviated commit of the checkout, marked where tracked files differ from it."""
     command = ["git", "-C", str(_ROOT), "describe", "--always", "--abbrev=7", "--exclude=*", "--dirty=+changes"]

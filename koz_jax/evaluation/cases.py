@@ -24,6 +24,7 @@ from koz_jax.errors import SettingsError
 from koz_jax.evaluation import cautions, rollout
 from koz_jax.evaluation.rollout import CaseResult, History
 from koz_jax.task import maneuver, uncertainty
+from koz_jax.task.any_spacecraft import spread
 from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.environment import Reorientation
 from koz_jax.task.scenario import SamplingRule, Scenario
@@ -36,9 +37,6 @@ _PURPOSE = 0x4D43
 
 # Separates what is random in flight from the draw of the cases.
 _IN_FLIGHT = 0x464C59
-
-# Separates what is drawn for a case besides its scenario.
-_SPREAD = 0x535052
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,7 +97,7 @@ def _of_case(env: Reorientation, key: jax.Array, index: jax.Array | int, shield:
     """An environment with all that is drawn for a case, and the shield of the spacecraft that is drawn."""
     if env.spread is None:
         return env
-    return under_shield(env.drawn(jax.random.fold_in(jax.random.fold_in(key, _SPREAD), index)), shield)
+    return under_shield(env.drawn(jax.random.fold_in(jax.random.fold_in(key, spread.PURPOSE), index)), shield)
 
 
 def _flight_key(key: jax.Array, index: jax.Array | int) -> jax.Array:

@@ -22,6 +22,7 @@ from koz_jax.control.shield.filter import under_shield
 from koz_jax.learning.train_step import MAX_DRAWS
 from koz_jax.sac.networks import Params
 from koz_jax.task import rotations
+from koz_jax.task.any_spacecraft import spread
 from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.environment import Reorientation
 from koz_jax.task.reward import Outcome
@@ -29,9 +30,6 @@ from koz_jax.task.scenario import SamplingRule
 from koz_jax.task.state import EnvState
 
 Tree = TypeVar("Tree")
-
-# Separates what is drawn for a maneuver besides its scenario.
-_SPREAD = 0x535052
 
 # Share of the rate limit from which a rate costs something, and how fast that grows.
 _RATE_KEPT = 0.95
@@ -121,7 +119,7 @@ def maneuver_cost(
 
     reach: () largest norm of the gradient that passes back from step to step, None for any.  Returns ().
     """
-    env = under_shield(env.drawn(jax.random.fold_in(key, _SPREAD)), config.shielding.in_force)
+    env = under_shield(env.drawn(jax.random.fold_in(key, spread.PURPOSE)), config.shielding.in_force)
 
     def advance(state: EnvState, _: None) -> tuple[EnvState, jax.Array]:
         state = state if reach is None else state.replace(body=_limit_gradient(state.body, reach))

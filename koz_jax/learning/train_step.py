@@ -17,7 +17,7 @@ from koz_jax.sac.learner import LearnerMetrics, LearnerState, Sac
 from koz_jax.sac.losses import Batch
 from koz_jax.sac.replay_buffer import ReplayBuffer, Transition
 from koz_jax.task import observation_layout, reward
-from koz_jax.task.any_spacecraft import units
+from koz_jax.task.any_spacecraft import spread, units
 from koz_jax.task.environment import Reorientation
 from koz_jax.task.observation_layout import ACTION_SIZE
 from koz_jax.task.reward import RewardTerms
@@ -29,9 +29,6 @@ MAX_DRAWS = 8
 
 # Episodes start in so many groups, spread over an episode, so that the buffer holds all parts of a maneuver.
 _START_GROUPS = 16
-
-# Separates what is drawn for an episode from everything else that is random.
-_SPREAD = 0x535052
 
 
 class TrainState(struct.PyTreeNode):
@@ -99,7 +96,7 @@ def environments_at(config: TrainConfig, env: Reorientation, step: jax.Array) ->
     if env.spread is None:
         return under_shield(env, config.shielding.in_force)
     episodes = (step + _head_starts(config)) // config.training_episode_steps
-    base = jax.random.fold_in(jax.random.key(config.seed), _SPREAD)
+    base = jax.random.fold_in(jax.random.key(config.seed), spread.PURPOSE)
 
     def drawn(number: jax.Array, episode: jax.Array) -> Reorientation:
         key = jax.random.fold_in(jax.random.fold_in(base, number), episode)

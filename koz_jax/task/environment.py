@@ -36,14 +36,10 @@ class Reorientation(struct.PyTreeNode):
     action_filter: ActionFilter | None = None  # None lets every action through
     uncertainty: Uncertainty | None = None  # None flies the model itself, measured exactly
     spread: Spread | None = None  # None flies every maneuver with the same spacecraft
-    urgency: jax.Array = struct.field(
-        default_factory=lambda: jnp.float32(0.5)
-    )  # () in [0, 1], for policies that see it
+    urgency: jax.Array | float = 0.5  # () in [0, 1], for policies that see it
     rule: SamplingRule = struct.field(pytree_node=False, default=SamplingRule())
     observed_zones: int = struct.field(pytree_node=False, default=1)
-    scaled: bool = struct.field(
-        pytree_node=False, default=False
-    )  # observations and actions as of ``any_spacecraft.nondimensional``
+    scaled: bool = struct.field(pytree_node=False, default=False)  # sees and acts as of ``nondimensional``
     episode_steps: int = struct.field(pytree_node=False, default=1000)
 
     @classmethod
@@ -164,9 +160,9 @@ class Reorientation(struct.PyTreeNode):
             truth: what flies; by default the model.
         """
         known = before if measured is None else measured
-        command = self.filter(
-            known, nondimensional.command(jnp.clip(action, -1.0, 1.0), known, self.model) if self.scaled else action
-        )
+        if self.scaled:
+            action = nondimensional.command(jnp.clip(action, -1.0, 1.0), known, self.model)
+        command = self.filter(known, action)
         after, outcome = self._advance(before, command, state.nominal(self.model) if truth is None else truth)
         observed = self.observe(after)
         return Step(
@@ -221,7 +217,7 @@ class Reorientation(struct.PyTreeNode):
         """
 
         def restart() -> tuple[EnvState, jax.Array]:
-            fresh = self._of_each(Reorientation.reset)(self, keys())
+            fresh = self._of_each(Reorientation.reset, keys())
             return select_envs(over, (fresh, self.observe_each(fresh)), (states, observed))
 
         # Drawing scenarios costs more than a step, and most steps end no maneuver.
@@ -229,23 +225,19 @@ class Reorientation(struct.PyTreeNode):
 
     def observe_each(self, states: EnvState) -> jax.Array:
         """What a controller sees of each of many states, leaves (n, ...).  Returns (n, entries)."""
-        return self._of_each(Reorientation.observe)(self, states)
+        return self._of_each(Reorientation.observe, states)
 
-    def _of_each(self, method: Callable[..., Any]) -> Callable[..., Any]:
+    def _of_each(self, method: Callable[..., Any], *arguments: Any) -> Any:
         """Map a method over many environments: those of a stack, as ``drawn`` makes them, or all the same."""
-        stacked = self.model.dt.ndim > 0
-
-        def mapped(env: Reorientation, *states: Any) -> Any:
-            return jax.vmap(method, in_axes=(0 if stacked else None, *(0 for _ in states)))(env, *states)
-
-        return mapped
+        own = 0 if self.model.dt.ndim else None
+        return jax.vmap(method, in_axes=(own, *(0 for _ in arguments)))(self, *arguments)
 
     def step_autoreset(self, states: EnvState, actions: jax.Array, keys: Callable[[], jax.Array]) -> Step:
         """Step many environments; where that ends a maneuver, the next one begins within the same step.
 
         states: leaves (n, ...); actions: (n, 3); keys: as of ``autoreset``.  Returns leaves (n, ...).
         """
-        stepped = self._of_each(Reorientation.step)(self, states, actions)
+        stepped = self._of_each(Reorientation.step, states, actions)
         next_states, observed = self.autoreset(stepped.truncated, stepped.state, stepped.final_observation, keys)
         return stepped.replace(state=next_states, observation=observed)
 

@@ -14,6 +14,9 @@ from koz_jax.task.state import Model
 # Smallest second moment of a body of unit largest one: no body is thinner.
 _THINNEST = 0.05
 
+# Separates the keys of what is drawn here from all others of a maneuver.
+PURPOSE = 0x535052
+
 # Torque limits of the axes differ by at most this factor.
 _UNEQUAL = 2.0
 
