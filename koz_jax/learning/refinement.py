@@ -7,8 +7,7 @@ reward has steps (settled or not, progress or not) that have no gradient; the co
 """
 
 import functools
-from collections.abc import Callable
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +24,7 @@ from koz_jax.task import rotations
 from koz_jax.task.any_spacecraft import spread
 from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.environment import Reorientation
+from koz_jax.task.observation_layout import ACTION_SIZE
 from koz_jax.task.reward import Outcome
 from koz_jax.task.scenario import SamplingRule
 from koz_jax.task.state import EnvState
@@ -108,30 +108,43 @@ def maneuver_environment(config: TrainConfig) -> Reorientation:
     return env.replace(scaled=config.network.scaled)
 
 
-def maneuver_cost(
+class Flown(NamedTuple):
+    """A maneuver, for its gradient."""
+
+    cost: jax.Array  # () mean per step
+    observed: jax.Array  # (steps, entries) what the policy saw
+
+
+def fly_maneuver(
     controller: PolicyController,
     env: Reorientation,
     key: jax.Array,
     config: TrainConfig,
     reach: jax.Array | None = None,
-) -> jax.Array:
-    """Mean cost per step of one random maneuver over the horizon; differentiable in the controller.
+    nudges: jax.Array | None = None,
+) -> Flown:
+    """Fly one random maneuver over the horizon; its cost is differentiable in the controller and in the nudges.
 
-    reach: () largest norm of the gradient that passes back from step to step, None for any.  Returns ().
+    reach: () largest norm of the gradient that passes back from step to step, None for any; nudges: (steps, 3) added
+    to the actions.
     """
     env = under_shield(env.drawn(jax.random.fold_in(key, spread.PURPOSE)), config.shielding.in_force)
 
-    def advance(state: EnvState, _: None) -> tuple[EnvState, jax.Array]:
+    # To fly a step again on the way back is cheaper than to store everything that its gradient needs.
+    @functools.partial(jax.checkpoint, prevent_cse=False)
+    def advance(state: EnvState, nudge: jax.Array) -> tuple[EnvState, Flown]:
         state = state if reach is None else state.replace(body=_limit_gradient(state.body, reach))
-        stepped = env.step(state, controller.act(env.observe(state)))
+        observed = env.observe(state)
+        stepped = env.step(state, controller.act(observed) + nudge)
         cost = step_cost(stepped.outcome, env, config.refine)
         if env.model.max_rate is not None:
             rate = rotations.norm(stepped.state.body.omega_BN_B)
             cost = cost + config.refine.rate_weight * rate_cost(rate, env.model.max_rate)
-        return stepped.state, cost
+        return stepped.state, Flown(cost, observed)
 
-    _, costs = jax.lax.scan(advance, env.reset(key), None, length=config.refine_steps)
-    return jnp.mean(costs) * (env.model.dt / config.task.step_seconds)
+    nudges = jnp.zeros((config.refine_steps, ACTION_SIZE)) if nudges is None else nudges
+    _, steps = jax.lax.scan(advance, env.reset(key), nudges)
+    return Flown(jnp.mean(steps.cost) * (env.model.dt / config.task.step_seconds), steps.observed)
 
 
 @jax.custom_vjp
@@ -167,17 +180,43 @@ def _reach(config: RefineConfig, iteration: jax.Array) -> jax.Array | None:
 
 
 def _mean_gradient(
-    cost_of: Callable[[Params, jax.Array], jax.Array], policy: Params, keys: jax.Array, config: RefineConfig
+    config: TrainConfig, env: Reorientation, policy: Params, keys: jax.Array, reach: jax.Array | None
 ) -> tuple[jax.Array, Params]:
-    """Mean over maneuvers of the cost and of its gradient, each maneuver's clipped where the settings say so."""
-    if not config.max_maneuver_gradient:
-        return jax.value_and_grad(lambda policy: jnp.mean(jax.vmap(lambda key: cost_of(policy, key))(keys)))(policy)
+    """Mean over maneuvers of the cost and of its gradient."""
 
-    def one(key: jax.Array) -> tuple[jax.Array, Params]:
-        cost, gradient = jax.value_and_grad(cost_of)(policy, key)
-        return cost, _clipped(gradient, config.max_maneuver_gradient)
+    def mean_cost(policy: Params) -> jax.Array:
+        controller = PolicyController(policy, config.network)
+        return jnp.mean(jax.vmap(lambda key: fly_maneuver(controller, env, key, config, reach).cost)(keys))
 
-    return jax.tree.map(lambda leaf: jnp.mean(leaf, axis=0), jax.vmap(one)(keys))
+    return jax.value_and_grad(mean_cost)(policy)
+
+
+def _clipped_gradient(
+    config: TrainConfig, env: Reorientation, policy: Params, keys: jax.Array, reach: jax.Array | None
+) -> tuple[jax.Array, Params]:
+    """The same, each maneuver's gradient clipped by itself.
+
+    First what each action is worth, for all maneuvers at once, then of one maneuver after the other how the weights
+    change its actions: a sum over the steps as products of matrices, where the gradient of each maneuver along the
+    steps would be as many copies of all weights, read and written at every step.
+    """
+
+    def action_slopes(key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        def flown(nudges: jax.Array) -> Flown:
+            return fly_maneuver(PolicyController(policy, config.network), env, key, config, reach, nudges)
+
+        nudges = jnp.zeros((config.refine_steps, ACTION_SIZE))
+        (cost, observed), slopes = jax.value_and_grad(flown, has_aux=True)(nudges)
+        return cost, observed, slopes
+
+    def weight_gradient(maneuver: tuple[jax.Array, jax.Array]) -> Params:
+        observed, slopes = maneuver
+        _, pull = jax.vjp(lambda policy: PolicyController(policy, config.network).act(observed), policy)
+        return _clipped(pull(slopes)[0], config.refine.max_maneuver_gradient)
+
+    costs, observed, slopes = jax.vmap(action_slopes)(keys)
+    gradients = jax.lax.map(weight_gradient, (observed, slopes))
+    return jnp.mean(costs), jax.tree.map(lambda leaf: jnp.mean(leaf, axis=0), gradients)
 
 
 @functools.partial(jax.jit, static_argnames="config", donate_argnames="state")
@@ -190,10 +229,8 @@ def refine_chunk(config: TrainConfig, state: RefineState, iterations: jax.Array)
         key, key_cases = jax.random.split(state.key)
         keys, reach = jax.random.split(key_cases, config.refine.scenarios), _reach(config.refine, state.iterations)
 
-        def cost_of(policy: Params, key: jax.Array) -> jax.Array:
-            return maneuver_cost(PolicyController(policy, config.network), env, key, config, reach)
-
-        cost, gradient = _mean_gradient(cost_of, state.policy, keys, config.refine)
+        find = _clipped_gradient if config.refine.max_maneuver_gradient else _mean_gradient
+        cost, gradient = find(config, env, state.policy, keys, reach)
         change, optimizer = _optimizer(config.refine).update(gradient, state.optimizer)
         policy = optax.apply_updates(state.policy, change)
         return RefineState(policy, optimizer, key, state.iterations + 1), total + cost

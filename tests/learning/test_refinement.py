@@ -32,7 +32,7 @@ def outcome(angle=0.0, torque=0.0, margin=1.0):
 
 def mean_cost(policy, keys):
     controller = PolicyController(policy, CONFIG.network)
-    return jnp.mean(jax.vmap(lambda key: refinement.maneuver_cost(controller, ENV, key, CONFIG))(keys))
+    return jnp.mean(jax.vmap(lambda key: refinement.fly_maneuver(controller, ENV, key, CONFIG).cost)(keys))
 
 
 @pytest.mark.slow
@@ -56,6 +56,25 @@ def test_the_gradient_is_that_of_the_whole_maneuver(policy):
     measured = (along(step) - along(-step)) / (2 * step)
     assert abs(measured) > 1e-2
     np.testing.assert_allclose(jax.jit(jax.grad(along))(0.0), measured, rtol=0.02)
+
+
+@pytest.mark.slow
+def test_gradients_of_maneuvers_that_no_bound_clips_have_the_mean_of_the_whole(policy):
+    """Taken over the actions first and the weights after, they are the gradient of the mean cost."""
+    unclipped = CONFIG.refine.model_copy(update={"max_maneuver_gradient": 1e9})
+    keys = jax.random.split(jax.random.key(1), 4)
+
+    @jax.jit
+    def by_maneuver(policy):
+        config = CONFIG.model_copy(update={"refine": unclipped})
+        return refinement._clipped_gradient(config, ENV, policy, keys, None)
+
+    cost, gradient = by_maneuver(policy)
+    np.testing.assert_allclose(cost, jax.jit(mean_cost)(policy, keys), rtol=1e-5)
+    expected = jax.jit(jax.grad(mean_cost))(policy, keys)
+    largest = max(float(jnp.max(jnp.abs(leaf))) for leaf in jax.tree.leaves(expected))
+    for one, other in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-4 * largest)
 
 
 @pytest.mark.slow
