@@ -20,8 +20,9 @@ import stamp
 from koz_jax.agents.agent import load_agent
 from koz_jax.cli.exit_status import exit_status
 from koz_jax.config.monte_carlo import MonteCarloConfig
-from koz_jax.config.shield import ShieldConfig, UncertaintyConfig
+from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import TaskConfig
+from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.control.adversarial import AnyAdversary
 from koz_jax.control.base import Controller
 from koz_jax.control.registry import ADVERSARIAL, load_controller

@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from koz_jax.config.monte_carlo import MonteCarloConfig as MonteCarloConfig
     from koz_jax.config.presets import preset as preset
     from koz_jax.config.shield import ShieldConfig as ShieldConfig
-    from koz_jax.config.shield import UncertaintyConfig as UncertaintyConfig
     from koz_jax.config.task import ScenarioConfig as ScenarioConfig
     from koz_jax.config.task import SpacecraftConfig as SpacecraftConfig
     from koz_jax.config.task import TaskConfig as TaskConfig
     from koz_jax.config.training import TrainConfig as TrainConfig
+    from koz_jax.config.uncertainty import UncertaintyConfig as UncertaintyConfig
     from koz_jax.control.registry import load_controller as load_controller
     from koz_jax.errors import DamagedFileError as DamagedFileError
     from koz_jax.errors import KozError as KozError
@@ -47,7 +47,7 @@ _HOME = {
     "SpacecraftConfig": "config.task",
     "ScenarioConfig": "config.task",
     "ShieldConfig": "config.shield",
-    "UncertaintyConfig": "config.shield",
+    "UncertaintyConfig": "config.uncertainty",
     "MonteCarloConfig": "config.monte_carlo",
     "TrainConfig": "config.training",
     "preset": "config.presets",

@@ -15,7 +15,8 @@ from koz_jax.cli.flags import parsing
 from koz_jax.cli.flags.flight import AGENT
 from koz_jax.config.base import MarginDeg, Settings
 from koz_jax.config.maneuvers.maneuver_file import load_spacecraft
-from koz_jax.config.shield import CERTAIN, ShieldConfig, UncertaintyConfig
+from koz_jax.config.shield import ShieldConfig
+from koz_jax.config.uncertainty import CERTAIN, UncertaintyConfig
 
 
 class _FormatFlags(Settings):
@@ -33,7 +34,7 @@ class _FormatFlags(Settings):
     """Also write the shield, which keeps the boresight out of every zone; for --to c."""
     shield_margin_deg: MarginDeg = parsing.same_as(ShieldConfig, "margin_deg")
     robust: bool = False
-    """Make the shield withstand errors, which the next four flags set."""
+    """Make the shield withstand errors, which the flags of errors set."""
 
 
 class ExportFlags(UncertaintyConfig, _FormatFlags):

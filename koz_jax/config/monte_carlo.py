@@ -7,7 +7,8 @@ from typing import Self
 from pydantic import model_validator
 
 from koz_jax.config.base import CaseCount, CheckCount, DeviationDeg, NonNegativeInt, Seed, Settings
-from koz_jax.config.shield import ShieldConfig, UncertaintyConfig
+from koz_jax.config.shield import ShieldConfig
+from koz_jax.config.uncertainty import UncertaintyConfig
 
 
 class CaseConfig(Settings):

@@ -12,6 +12,7 @@ from koz_jax.config.training import (
     SacConfig,
     TrainConfig,
 )
+from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.errors import SettingsError
 
 
@@ -124,27 +125,35 @@ def _universal() -> TrainConfig:
             "curriculum": shorter,
             "task": TaskConfig(
                 spread=SpreadConfig(
-                    spacecraft=True, step_shares=(0.014, 0.06), max_rate_deg=(2.0, 60.0), urgency=(0.0, 1.0)
+                    spacecraft=True,
+                    step_shares=(0.016, 0.06),
+                    # Most of them bind no maneuver: an agent without a limit is at the end of what it knows.
+                    max_rate_deg=(2.0, 150.0),
+                    urgency=(0.0, 1.0),
+                    errors=UncertaintyConfig(
+                        inertia_error=0.1, disturbance_torque=0.01, attitude_noise_deg=0.01, rate_noise_deg=0.001
+                    ),
+                    delay_steps=(0, 2),
                 )
             ),
             "eval_cases": 400,
             "refine_eval_every": 500,
             "network": NetworkConfig(
-                hidden_sizes=(128, 128), encoding=EncodingConfig(rate_scales=(0.016, 0.16)), scaled=True
+                hidden_sizes=(160, 160), encoding=EncodingConfig(rate_scales=(0.016, 0.16)), scaled=True
             ),
             "refine": fast.refine.model_copy(
                 update={
-                    "horizon_seconds": 40.0,
+                    "horizon_seconds": 45.0,
                     "learning_rate": 2e-3,
                     "effort_weight": 3.46,
-                    "urgency_factor": 11.5,
+                    "urgency_factor": 14.0,
                     "rate_weight": 20.0,
                     "change_weight": 5.0,
                     "max_maneuver_gradient": 0.1,
                     "state_gradient": (1.0, 300.0),
                     "max_gradient_norm": 1.0,
                     "scenarios": 96,
-                    "iterations": 4000,
+                    "iterations": 8000,
                 }
             ),
         }

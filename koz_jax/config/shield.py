@@ -1,27 +1,14 @@
-"""Settings of the shield and of what it has to withstand.  Angles in degrees; imports no jax."""
+"""Settings of the shield.  Angles in degrees; imports no jax."""
 
 from __future__ import annotations
 
-from pydantic import AliasChoices, Field
+from typing import Self
 
-from koz_jax.config.base import MarginDeg, NonNegativeFloat, PositiveFloat, PositiveInt, Settings, ShareBelowOne, Vector
+from pydantic import AliasChoices, Field, model_validator
+
+from koz_jax.config.base import MarginDeg, PositiveFloat, PositiveInt, Settings, Vector
+from koz_jax.config.uncertainty import CERTAIN, UncertaintyConfig
 from koz_jax.errors import SettingsError
-
-
-class UncertaintyConfig(Settings):
-    """How far the truth may be from the model."""
-
-    inertia_error: ShareBelowOne = 0.0
-    """Largest relative error of the inertia about any axis."""
-    disturbance_torque: NonNegativeFloat = 0.0
-    """Norm of a constant torque from outside [N m]."""
-    attitude_noise_deg: NonNegativeFloat = 0.0
-    """Standard deviation per axis of the measured attitude [deg], cut at 3 times that."""
-    rate_noise_deg: NonNegativeFloat = 0.0
-    """Standard deviation per axis of the measured rate [deg/s], cut at 3 times that."""
-
-
-CERTAIN = UncertaintyConfig()
 
 
 class ShieldConfig(Settings):
@@ -37,6 +24,14 @@ class ShieldConfig(Settings):
     """Rate with which the boresight is led around a zone [deg/s]; by default what suits the spacecraft."""
     samples: PositiveInt = 12
     """Samples of a brake path: more are less cautious and slower."""
+
+    @model_validator(mode="after")
+    def _withstands(self) -> Self:
+        if self.error_bounds.delay_steps:
+            raise ValueError(
+                f"delay_steps: the shield does not withstand a delay; allowed is 0, got {self.error_bounds.delay_steps}"
+            )
+        return self
 
     def check(self, torque_limits: Vector) -> None:
         """Refuse to withstand what a spacecraft has no torque for.

@@ -7,6 +7,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from koz_jax.config.base import PositiveFloat, Settings
+from koz_jax.config.uncertainty import CERTAIN, DelaySteps, UncertaintyConfig
 
 Urgency = Annotated[float, Field(ge=0, le=1)]
 
@@ -24,9 +25,14 @@ class SpreadConfig(Settings):
     urgency: tuple[Urgency, Urgency] | None = None
     """Urgencies that an agent is trained with; None leaves 0.5."""
 
+    errors: UncertaintyConfig = CERTAIN
+    """Errors that every maneuver is flown with."""
+    delay_steps: tuple[DelaySteps, DelaySteps] | None = None
+    """Steps by which the torque comes late, distributed evenly; None leaves those of ``errors``."""
+
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        for name in ("step_shares", "max_rate_deg", "urgency"):
+        for name in ("step_shares", "max_rate_deg", "urgency", "delay_steps"):
             limits = getattr(self, name)
             if limits is not None and limits[0] > limits[1]:
                 raise ValueError(f"{name} must be in order; got {limits}")
@@ -35,4 +41,4 @@ class SpreadConfig(Settings):
     @property
     def is_none(self) -> bool:
         """Whether nothing is drawn."""
-        return not self.spacecraft and self.max_rate_deg is None and self.urgency is None
+        return not self.spacecraft and self.max_rate_deg is self.urgency is self.delay_steps is None

@@ -18,7 +18,7 @@ from flax import struct
 from koz_jax.config.training import RefineConfig, TrainConfig
 from koz_jax.control.policy import PolicyController
 from koz_jax.control.shield.filter import under_shield
-from koz_jax.learning.train_step import MAX_DRAWS
+from koz_jax.learning.train_step import MAX_DRAWS, flight_errors
 from koz_jax.sac.networks import Params
 from koz_jax.task import rotations
 from koz_jax.task.any_spacecraft import spread
@@ -129,13 +129,15 @@ def fly_maneuver(
     to the actions.
     """
     env = under_shield(env.drawn(jax.random.fold_in(key, spread.PURPOSE)), config.shielding.in_force)
+    truth, noise = flight_errors(env, key)
 
     # To fly a step again on the way back is cheaper than to store everything that its gradient needs.
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def advance(state: EnvState, nudge: jax.Array) -> tuple[EnvState, Flown]:
         state = state if reach is None else state.replace(body=_limit_gradient(state.body, reach))
-        observed = env.observe(state)
-        stepped = env.step(state, controller.act(observed) + nudge)
+        measured = state if noise is None else env.measure(state, noise)
+        observed = env.observe(measured)
+        stepped = env.step(state, controller.act(observed) + nudge, measured=measured, truth=truth)
         cost = step_cost(stepped.outcome, env, config.refine)
         if env.model.max_rate is not None:
             rate = rotations.norm(stepped.state.body.omega_BN_B)

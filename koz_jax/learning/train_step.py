@@ -22,13 +22,16 @@ from koz_jax.task.environment import Reorientation
 from koz_jax.task.observation_layout import ACTION_SIZE
 from koz_jax.task.reward import RewardTerms
 from koz_jax.task.scenario import SamplingRule
-from koz_jax.task.state import EnvState
+from koz_jax.task.state import EnvState, Truth
 
 # Training draws scenarios all the time, also at angles where no zone fits; it soon takes what it can get.
 MAX_DRAWS = 8
 
 # Episodes start in so many groups, spread over an episode, so that the buffer holds all parts of a maneuver.
 _START_GROUPS = 16
+
+# Separates the keys of what an episode meets from those of what else is drawn for it.
+_ERRORS = 0x455252
 
 
 class TrainState(struct.PyTreeNode):
@@ -88,30 +91,55 @@ def _head_starts(config: TrainConfig) -> jax.Array:
     return group * config.training_episode_steps // _START_GROUPS
 
 
-def environments_at(config: TrainConfig, env: Reorientation, step: jax.Array) -> Reorientation:
-    """The environments as they are in the episode that each is in: a stack, or one where nothing is drawn for them.
+class Episodes(struct.PyTreeNode):
+    """What is drawn for the episode that each environment is in."""
+
+    env: Reorientation  # a stack, or one where nothing is drawn for them
+    truth: Truth | None  # leaves (num_envs, ...); None where the model flies
+    noise: jax.Array | None  # (num_envs,) typed PRNG keys of what is measured; None where that is exact
+
+    def measure(self, states: EnvState) -> EnvState:
+        """What sensors make of the states, leaves (num_envs, ...)."""
+        return states if self.noise is None else self.env.map(Reorientation.measure, states, self.noise)
+
+
+def episodes_at(config: TrainConfig, env: Reorientation, step: jax.Array) -> Episodes:
+    """The environments as they are in the episode that each is in.
 
     step: () int32, steps of all environments since the start of the run, the random ones included.
     """
-    if env.spread is None:
-        return under_shield(env, config.shielding.in_force)
+    if env.spread is None and env.uncertainty is None:
+        return Episodes(under_shield(env, config.shielding.in_force), None, None)
     episodes = (step + _head_starts(config)) // config.training_episode_steps
     base = jax.random.fold_in(jax.random.key(config.seed), spread.PURPOSE)
 
-    def drawn(number: jax.Array, episode: jax.Array) -> Reorientation:
+    def drawn(number: jax.Array, episode: jax.Array) -> Episodes:
         key = jax.random.fold_in(jax.random.fold_in(base, number), episode)
-        return under_shield(env.drawn(key), config.shielding.in_force)
+        own = under_shield(env.drawn(key), config.shielding.in_force)
+        return Episodes(own, *flight_errors(own, key))
 
     return jax.vmap(drawn)(jnp.arange(config.num_envs), episodes)
 
 
+def flight_errors(env: Reorientation, key: jax.Array) -> tuple[Truth | None, jax.Array | None]:
+    """What an environment meets in one maneuver: the truth, and the key of its noise; None where it has no errors.
+
+    key: () typed PRNG key of the maneuver.
+    """
+    if env.uncertainty is None:
+        return None, None
+    key_truth, key_noise = jax.random.split(jax.random.fold_in(key, _ERRORS))
+    return env.sample_truth(key_truth), key_noise
+
+
 def _advance(
-    config: TrainConfig, env: Reorientation, states: EnvState, action: jax.Array, key: jax.Array
+    config: TrainConfig, at: Episodes, states: EnvState, observed: jax.Array, action: jax.Array, key: jax.Array
 ) -> tuple[EnvState, Transition]:
     """One step of all environments; those at the end of their episode start a new scenario."""
-    stepped = env.step_autoreset(states, action, lambda: jax.random.split(key, config.num_envs))
+    met = {"measured": at.measure(states), "truth": at.truth, "noise": at.noise}
+    stepped = at.env.step_autoreset(states, action, lambda: jax.random.split(key, config.num_envs), **met)
     return stepped.state, Transition(
-        observation=env.observe_each(states),
+        observation=observed,
         action=action,
         outcome=stepped.outcome,
         terminated=stepped.terminated,
@@ -132,7 +160,8 @@ def init(config: TrainConfig, key: jax.Array) -> TrainState:
     def random_step(states: EnvState, number: jax.Array, key_step: jax.Array) -> tuple[EnvState, Transition]:
         key_action, key_reset = jax.random.split(key_step)
         action = jax.random.uniform(key_action, (config.num_envs, ACTION_SIZE), minval=-1.0, maxval=1.0)
-        return _advance(config, environments_at(config, env, number), states, action, key_reset)
+        at = episodes_at(config, env, number)
+        return _advance(config, at, states, at.env.observe_each(at.measure(states)), action, key_reset)
 
     example = jax.eval_shape(random_step, states, jnp.int32(0), key_fill)[1]
     buffer = replay_buffer.init(example, config.buffer_steps)
@@ -178,10 +207,10 @@ def train_step(config: TrainConfig, env: Reorientation, state: TrainState) -> tu
 
     env = at_difficulty(env, at)
     step = config.prefill_steps + state.updates // config.updates_per_step
-    envs = environments_at(config, env, step)
-    observed = envs.observe_each(state.env_states)
+    episodes = episodes_at(config, env, step)
+    observed = episodes.env.observe_each(episodes.measure(state.env_states))
     action, _ = sac.act(state.learner.policy, observed).sample(key_action)
-    env_states, transition = _advance(config, envs, state.env_states, action, key_reset)
+    env_states, transition = _advance(config, episodes, state.env_states, observed, action, key_reset)
     buffer = replay_buffer.insert(state.buffer, transition)
 
     drawn = _rewarded_batch(config, env, buffer, at, key_batch)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from koz_jax.config.task import TaskConfig, check_deviations, check_feasible
+from koz_jax.config.uncertainty import CERTAIN
 from koz_jax.task import actuators, maneuver, observation, pointing_constraints, reward, rotations, scenario, state
 from koz_jax.task import uncertainty as errors
 from koz_jax.task.actuators import TorqueLimits
@@ -63,7 +64,7 @@ class Reorientation(struct.PyTreeNode):
             rule: how scenarios are drawn; by default until one is feasible.
             observed_zones: zones in the observation; by default all that a scenario can have.
             action_filter: what stands between controller and actuators, such as the shield.
-            uncertainty: how far the truth may be from the model.
+            uncertainty: how far the truth may be from the model; by default as the task's spread says.
 
         Raises:
             SettingsError: the angles are not in [0, 180], not in order, or leave no room for a zone.
@@ -78,7 +79,7 @@ class Reorientation(struct.PyTreeNode):
             reward=reward.from_config(task.reward, task.angle_convention),
             ranges=scenario.from_config(task.scenario, task.spacecraft.boresight, min_angle_deg, max_angle_deg),
             action_filter=action_filter,
-            uncertainty=uncertainty,
+            uncertainty=uncertainty or errors_of(task),
             spread=spread.from_config(task),
             rule=rule or SamplingRule(task.scenario.infeasible_zone),
             observed_zones=observed_zones or task.scenario.max_zones,
@@ -91,7 +92,12 @@ class Reorientation(struct.PyTreeNode):
             return self
         found = spread.draw(self.spread, self.model, self.ranges.boresight_B, key)
         ranges = self.ranges.replace(boresight_B=found.boresight_B)
-        return self.replace(model=found.model, ranges=ranges, urgency=found.urgency, spread=None)
+        uncertainty = self.uncertainty
+        if uncertainty is not None and found.delay is not None:
+            uncertainty = uncertainty.replace(delay=found.delay)
+        return self.replace(
+            model=found.model, ranges=ranges, urgency=found.urgency, uncertainty=uncertainty, spread=None
+        )
 
     @property
     def nominal_limits(self) -> TorqueLimits:
@@ -108,7 +114,8 @@ class Reorientation(struct.PyTreeNode):
         A scenario is checked, see ``maneuver.checked``, where it is not being traced.
         """
         drawn = maneuver.checked(start) if isinstance(start, Scenario) else self.sample(start)
-        return state.begin(drawn, self.model)
+        late = self.uncertainty is not None and self.uncertainty.delay is not None
+        return state.begin(drawn, self.model, late)
 
     def covers(self, at: EnvState) -> jax.Array:
         """Whether what the filter guarantees holds from this state on; also where there is none.  Returns () bool."""
@@ -134,7 +141,7 @@ class Reorientation(struct.PyTreeNode):
         """What sensors make of a state.  key: () typed PRNG key of the maneuver's noise."""
         if self.uncertainty is None:
             return at
-        return errors.add_sensor_noise(self.uncertainty, at, jax.random.fold_in(key, at.steps))
+        return errors.add_sensor_errors(self.uncertainty, at, key)
 
     def filter(self, measured: EnvState, action: jax.Array) -> Command:
         """Clip an action (3,) to [-1, 1], and pass it through the filter.
@@ -148,7 +155,13 @@ class Reorientation(struct.PyTreeNode):
         return Command(requested, _straight_through(requested, self.action_filter.allow(held, asked, self.model)))
 
     def step(
-        self, before: EnvState, action: jax.Array, *, measured: EnvState | None = None, truth: Truth | None = None
+        self,
+        before: EnvState,
+        action: jax.Array,
+        *,
+        measured: EnvState | None = None,
+        truth: Truth | None = None,
+        noise: jax.Array | None = None,
     ) -> Step:
         """Fly one time step.
 
@@ -158,13 +171,15 @@ class Reorientation(struct.PyTreeNode):
                 of ``nondimensional.command``.
             measured: what the filter knows of the state; by default the state itself.
             truth: what flies; by default the model.
+            noise: () typed PRNG key of the maneuver's noise, to observe what is measured; by default the state itself
+                is observed.
         """
         known = before if measured is None else measured
         if self.scaled:
             action = nondimensional.command(jnp.clip(action, -1.0, 1.0), known, self.model)
         command = self.filter(known, action)
         after, outcome = self._advance(before, command, state.nominal(self.model) if truth is None else truth)
-        observed = self.observe(after)
+        observed = self.observe(after if noise is None else self.measure(after, noise))
         return Step(
             state=after,
             observation=observed,
@@ -177,13 +192,15 @@ class Reorientation(struct.PyTreeNode):
         )
 
     def _advance(self, before: EnvState, command: Command, truth: Truth) -> tuple[EnvState, Outcome]:
-        torque_B, actuator_state = self.model.actuators.apply(command.applied, before.actuators)
+        now, on_the_way = state.delayed(command.applied, before.on_the_way, truth.delay)
+        torque_B, actuator_state = self.model.actuators.apply(now, before.actuators)
         after = before.replace(
             body=state.propagate(before.body, torque_B, truth, self.model.dt),
             q_e0_previous=attitude_error(before)[0],
             torque_B=torque_B,
             steps=before.steps + 1,
             actuators=actuator_state,
+            on_the_way=on_the_way,
         )
         after = after.replace(angle=rotations.rotation_angle(attitude_error(after)))
         change = jnp.where(before.steps == 0, 0.0, rotations.norm(torque_B - before.torque_B))
@@ -217,7 +234,7 @@ class Reorientation(struct.PyTreeNode):
         """
 
         def restart() -> tuple[EnvState, jax.Array]:
-            fresh = self._of_each(Reorientation.reset, keys())
+            fresh = self.map(Reorientation.reset, keys())
             return select_envs(over, (fresh, self.observe_each(fresh)), (states, observed))
 
         # Drawing scenarios costs more than a step, and most steps end no maneuver.
@@ -225,19 +242,24 @@ class Reorientation(struct.PyTreeNode):
 
     def observe_each(self, states: EnvState) -> jax.Array:
         """What a controller sees of each of many states, leaves (n, ...).  Returns (n, entries)."""
-        return self._of_each(Reorientation.observe, states)
+        return self.map(Reorientation.observe, states)
 
-    def _of_each(self, method: Callable[..., Any], *arguments: Any) -> Any:
+    def map(self, method: Callable[..., Any], *arguments: Any) -> Any:
         """Map a method over many environments: those of a stack, as ``drawn`` makes them, or all the same."""
         own = 0 if self.model.dt.ndim else None
         return jax.vmap(method, in_axes=(own, *(0 for _ in arguments)))(self, *arguments)
 
-    def step_autoreset(self, states: EnvState, actions: jax.Array, keys: Callable[[], jax.Array]) -> Step:
+    def step_autoreset(self, states: EnvState, actions: jax.Array, keys: Callable[[], jax.Array], **met: Any) -> Step:
         """Step many environments; where that ends a maneuver, the next one begins within the same step.
 
-        states: leaves (n, ...); actions: (n, 3); keys: as of ``autoreset``.  Returns leaves (n, ...).
+        states: leaves (n, ...); actions: (n, 3); keys: as of ``autoreset``; met: what else ``step`` takes, leaves
+        (n, ...).  Returns leaves (n, ...).
         """
-        stepped = self._of_each(Reorientation.step, states, actions)
+
+        def step(env: Reorientation, state: EnvState, action: jax.Array, met: dict[str, Any]) -> Step:
+            return env.step(state, action, **met)
+
+        stepped = self.map(step, states, actions, met)
         next_states, observed = self.autoreset(stepped.truncated, stepped.state, stepped.final_observation, keys)
         return stepped.replace(state=next_states, observation=observed)
 
@@ -253,6 +275,13 @@ def _straight_through_jvp(
     values: tuple[jax.Array, jax.Array], slopes: tuple[jax.Array, jax.Array]
 ) -> tuple[jax.Array, jax.Array]:
     return values[1], slopes[0]
+
+
+def errors_of(task: TaskConfig) -> Uncertainty | None:
+    """Errors that every maneuver of a task is flown with; a delay that is spread is drawn with what else is."""
+    if task.spread.delay_steps is not None:
+        return errors.from_config(task.spread.errors).replace(delay=jnp.int32(0))
+    return None if task.spread.errors == CERTAIN else errors.from_config(task.spread.errors)
 
 
 def model_from_config(task: TaskConfig) -> Model:

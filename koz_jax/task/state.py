@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from koz_jax.config.uncertainty import MAX_DELAY
 from koz_jax.task import dynamics, rotations
 from koz_jax.task.actuators import Actuators, ActuatorState, TorqueLimits
 from koz_jax.task.dynamics import RigidBodyState
@@ -29,6 +30,7 @@ class Truth(struct.PyTreeNode):
 
     inertia_B: jax.Array  # (3, 3) [kg m^2]
     disturbance_B: jax.Array  # (3,) [N m] constant torque from outside, in body axes
+    delay: jax.Array | None = None  # () int32, steps by which the torque comes late, to MAX_DELAY; None: never
 
 
 class EnvState(struct.PyTreeNode):
@@ -41,6 +43,9 @@ class EnvState(struct.PyTreeNode):
     torque_B: jax.Array  # (3,) [N m] applied in the last step
     steps: jax.Array  # () int32, steps since the reset
     actuators: ActuatorState = None
+    on_the_way: jax.Array | None = (
+        None  # (MAX_DELAY, 3) commands of the last steps, the latest first; where any is late
+    )
 
 
 class ActionFilter(Protocol):
@@ -85,8 +90,8 @@ class Step(struct.PyTreeNode):
     truncated: jax.Array  # () bool, the maneuver's time is up
 
 
-def begin(scenario: Scenario, model: Model) -> EnvState:
-    """The state in which a scenario starts."""
+def begin(scenario: Scenario, model: Model, late: bool = False) -> EnvState:
+    """The state in which a scenario starts.  late: whether torques may come late."""
     state = EnvState(
         body=scenario.initial,
         scenario=scenario,
@@ -95,6 +100,7 @@ def begin(scenario: Scenario, model: Model) -> EnvState:
         torque_B=jnp.zeros(3),
         steps=jnp.zeros((), jnp.int32),
         actuators=model.actuators.initial_state(),
+        on_the_way=jnp.zeros((MAX_DELAY, 3)) if late else None,
     )
     q_e = attitude_error(state)
     return state.replace(angle=rotations.rotation_angle(q_e), q_e0_previous=q_e[0])
@@ -113,6 +119,20 @@ def torque_limits(state: EnvState, model: Model) -> TorqueLimits:
 def nominal(model: Model) -> Truth:
     """The truth that is as the model says."""
     return Truth(inertia_B=model.inertia_B, disturbance_B=jnp.zeros(3))
+
+
+def delayed(
+    command: jax.Array, on_the_way: jax.Array | None, delay: jax.Array | None
+) -> tuple[jax.Array, jax.Array | None]:
+    """The command (3,) that reaches the actuators in this step, and those that are on the way after it.
+
+    command: (3,) given in this step; on_the_way: (MAX_DELAY, 3), the latest first; delay: () int32.
+    """
+    if delay is None:
+        return command, on_the_way
+    assert on_the_way is not None, "the state was not begun for late torques"
+    given = jnp.concatenate([command[None], on_the_way])
+    return given[delay], given[:-1]
 
 
 def propagate(body: RigidBodyState, torque_B: jax.Array, truth: Truth, seconds: jax.Array) -> RigidBodyState:

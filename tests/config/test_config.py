@@ -10,9 +10,10 @@ from pydantic import ValidationError
 from koz_jax.config import presets
 from koz_jax.config.base import Settings, checked, constant, ramp_value
 from koz_jax.config.monte_carlo import MonteCarloConfig
-from koz_jax.config.shield import ShieldConfig, UncertaintyConfig
+from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import SpacecraftConfig, TaskConfig, check_deviations, is_paper_task
 from koz_jax.config.training import TrainConfig
+from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.errors import KozError, SettingsError, explain
 
 FAST = presets.preset("fast")

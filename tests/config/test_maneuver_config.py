@@ -14,7 +14,7 @@ from support.tiny import ROOT, merged
 from koz_jax.config import attitudes
 from koz_jax.config.maneuvers.maneuver import ManeuverConfig
 from koz_jax.config.maneuvers.maneuver_file import load_maneuver, load_spacecraft
-from koz_jax.config.shield import UncertaintyConfig
+from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.errors import SettingsError
 from koz_jax.task import rotations
 
@@ -86,9 +86,9 @@ def test_lasts_five_half_turns_about_the_slowest_axis_in_whole_tens():
 
 
 def test_errors_become_what_is_flown_with():
-    found = made(errors={"inertia": 0.1, "disturbance_torque": 1e-6, "attitude_noise_deg": 0.01, "delay_steps": 0})
+    found = made(errors={"inertia": 0.1, "disturbance_torque": 1e-6, "attitude_noise_deg": 0.01, "delay_steps": 2})
     assert found.has_errors
-    expected = UncertaintyConfig(inertia_error=0.1, disturbance_torque=1e-6, attitude_noise_deg=0.01)
+    expected = UncertaintyConfig(inertia_error=0.1, disturbance_torque=1e-6, attitude_noise_deg=0.01, delay_steps=2)
     assert found.errors.uncertainty == expected
 
 
@@ -213,8 +213,8 @@ REFUSED = {
     ),
     "delay": (
         "[start]",
-        "[errors]\ndelay_steps = 1\n[start]",
-        "errors.delay_steps: not supported yet; allowed is 0 (got 1)",
+        "[errors]\ndelay_steps = 4\n[start]",
+        "errors.delay_steps: Input should be less than or equal to 3 (got 4)",
     ),
     "long direction": (
         DIRECTION,

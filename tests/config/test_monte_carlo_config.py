@@ -7,7 +7,8 @@ from pydantic import ValidationError
 
 from koz_jax.config.base import checked
 from koz_jax.config.monte_carlo import MonteCarloConfig
-from koz_jax.config.shield import ShieldConfig, UncertaintyConfig
+from koz_jax.config.shield import ShieldConfig
+from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.errors import SettingsError
 
 

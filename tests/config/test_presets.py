@@ -88,7 +88,7 @@ def test_spacecraft_of_the_paper(name):
     assert task.spacecraft.torque_limit == 2.0
     assert task.step_seconds == 0.1
     assert task.episode_seconds == 100.0
-    assert task.episode_steps == (1000 if name != "universal" else round(100.0 / (0.014 * 30.0**0.5)))
+    assert task.episode_steps == (1000 if name != "universal" else round(100.0 / (0.016 * 30.0**0.5)))
     assert task.angle_convention == "full"
 
 

@@ -5,7 +5,8 @@ import json
 import pytest
 from pydantic import ValidationError
 
-from koz_jax.config.shield import CERTAIN, ShieldConfig, UncertaintyConfig
+from koz_jax.config.shield import ShieldConfig
+from koz_jax.config.uncertainty import CERTAIN, UncertaintyConfig
 from koz_jax.errors import SettingsError, explain
 
 ERRORS = UncertaintyConfig(inertia_error=0.1, disturbance_torque=0.01)
@@ -39,3 +40,9 @@ def test_a_disturbance_must_be_weaker_than_the_weakest_axis(limits):
         strong = ShieldConfig(error_bounds=UncertaintyConfig(disturbance_torque=torque))
         with pytest.raises(SettingsError, match=rf"disturbance_torque: must be below .* 2\.0 N m .*, got {torque}"):
             strong.check(limits)
+
+
+def test_a_delay_is_not_withstood_and_refused_by_name():
+    with pytest.raises(ValidationError) as caught:
+        ShieldConfig(error_bounds=UncertaintyConfig(delay_steps=1))
+    assert "delay_steps: the shield does not withstand a delay; allowed is 0, got 1" in explain(caught.value)

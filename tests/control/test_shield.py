@@ -13,8 +13,9 @@ from support import oracle, states
 
 from koz_jax.agents.agent import load_agent
 from koz_jax.config.monte_carlo import MonteCarloConfig
-from koz_jax.config.shield import ShieldConfig, UncertaintyConfig
+from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import SpacecraftConfig, TaskConfig
+from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.control.adversarial import AnyAdversary
 from koz_jax.control.registry import ADVERSARIAL
 from koz_jax.control.shield import brake_path

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from koz_jax.config.monte_carlo import MonteCarloConfig
-from koz_jax.config.shield import ShieldConfig, UncertaintyConfig
+from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import TaskConfig
+from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.control.registry import load_controller
 from koz_jax.evaluation import cases
 from koz_jax.evaluation.rollout import CaseResult

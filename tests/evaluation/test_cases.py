@@ -11,9 +11,10 @@ from support import tiny
 
 from koz_jax.config import task
 from koz_jax.config.monte_carlo import MonteCarloConfig
-from koz_jax.config.shield import ShieldConfig, UncertaintyConfig
+from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.spread import SpreadConfig
 from koz_jax.config.task import TaskConfig
+from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.control.registry import load_controller
 from koz_jax.control.shield.filter import Shield
 from koz_jax.errors import SettingsError

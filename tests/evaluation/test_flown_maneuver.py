@@ -15,7 +15,8 @@ from koz_jax.agents.flight import load_for
 from koz_jax.config.maneuvers.maneuver import ManeuverConfig
 from koz_jax.config.maneuvers.maneuver_file import load_maneuver
 from koz_jax.config.monte_carlo import MonteCarloConfig
-from koz_jax.config.shield import ShieldConfig, UncertaintyConfig
+from koz_jax.config.shield import ShieldConfig
+from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.control.registry import load_controller
 from koz_jax.errors import SettingsError
 from koz_jax.evaluation import cases, maneuver, rollout

@@ -15,8 +15,9 @@ import pytest
 from support import tiny
 
 from koz_jax.config.monte_carlo import MonteCarloConfig
-from koz_jax.config.shield import ShieldConfig, UncertaintyConfig
+from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import TaskConfig
+from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.errors import SettingsError
 from koz_jax.evaluation import cases, monte_carlo
 from koz_jax.evaluation.monte_carlo import MonteCarlo

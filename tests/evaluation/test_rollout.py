@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from support import oracle
 
-from koz_jax.config.shield import ShieldConfig, UncertaintyConfig
+from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import RewardConfig, TaskConfig
+from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.control.base import Memoryless
 from koz_jax.control.registry import load_controller
 from koz_jax.control.shield.filter import under_shield

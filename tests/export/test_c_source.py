@@ -13,7 +13,8 @@ from support import oracle, spacecraft
 
 from koz_jax.agents.agent import Agent, load_agent
 from koz_jax.config.monte_carlo import MonteCarloConfig
-from koz_jax.config.shield import ShieldConfig, UncertaintyConfig
+from koz_jax.config.shield import ShieldConfig
+from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.evaluation import cases
 from koz_jax.export.files import export, write_files
 from koz_jax.export.golden import EXAMPLE_CASE

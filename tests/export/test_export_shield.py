@@ -14,8 +14,9 @@ from support import oracle, tiny
 
 from koz_jax.agents.agent import Agent, load_agent
 from koz_jax.config.monte_carlo import MonteCarloConfig
-from koz_jax.config.shield import ShieldConfig, UncertaintyConfig
+from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.training import TrainConfig
+from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.control.base import Controller
 from koz_jax.control.registry import load_controller
 from koz_jax.control.shield import filter as shield

@@ -16,6 +16,7 @@ from koz_jax.config.presets import preset
 from koz_jax.config.spread import SpreadConfig
 from koz_jax.config.task import RewardConfig, ScenarioConfig, TaskConfig
 from koz_jax.config.training import NetworkConfig, SacConfig, TrainConfig
+from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.learning import curriculum, train_step
 from koz_jax.runs import checkpoint
 from koz_jax.sac import learner as sac_learner
@@ -23,6 +24,7 @@ from koz_jax.sac import replay_buffer
 from koz_jax.task import observation
 from koz_jax.task.environment import Reorientation
 from koz_jax.task.scenario import SamplingRule
+from koz_jax.task.state import Truth
 
 pytestmark = pytest.mark.slow
 
@@ -456,6 +458,24 @@ def test_the_curriculum_sets_the_deviations_and_nothing_else_of_the_environment(
     jax.tree.map(np.testing.assert_array_equal, same, env)
 
 
+def test_what_an_episode_meets_is_the_same_through_it_and_another_in_each():
+    """Training flies the errors that evaluation does: truth, biases and delay are of an episode."""
+    errors = UncertaintyConfig(inertia_error=0.1, disturbance_torque=0.02, attitude_noise_deg=0.1, rate_noise_deg=0.1)
+    spread = CONFIG.task.model_copy(update={"spread": SpreadConfig(errors=errors, delay_steps=(0, 2))})
+    config = CONFIG.model_copy(update={"task": spread, "training_episode_seconds": 2.0, "num_envs": 32})
+    env = train_step.training_environment(config)
+    now, again = (train_step.episodes_at(config, env, jnp.int32(step)) for step in (0, 1))
+    assert isinstance(now.truth, Truth) and isinstance(again.truth, Truth)
+    same = np.asarray(now.noise == again.noise)
+    np.testing.assert_array_equal(np.all(np.asarray(now.truth.inertia_B == again.truth.inertia_B), axis=(1, 2)), same)
+    assert len(np.unique(np.asarray(now.truth.inertia_B)[:, 0, 0])) == config.num_envs
+    assert set(np.asarray(now.truth.delay).tolist()) == {0, 1, 2}
+    np.testing.assert_allclose(np.linalg.norm(now.truth.disturbance_B, axis=1), 0.02, rtol=1e-5)
+    # The first torques are on the way, and none has come.
+    state = train_step.init(config, jax.random.key(0)).env_states
+    assert state.on_the_way is not None and state.on_the_way.shape == (config.num_envs, 3, 3)
+
+
 def test_every_episode_has_a_spacecraft_of_its_own():
     """Environments are drawn anew exactly where their episode ends, and each differently."""
     spread = CONFIG.task.model_copy(update={"spread": SpreadConfig(spacecraft=True, urgency=(0.0, 1.0))})
@@ -464,10 +484,10 @@ def test_every_episode_has_a_spacecraft_of_its_own():
     env = train_step.training_environment(config)
     state = train_step.init(config, jax.random.key(0))
     step = jax.jit(functools.partial(train_step.train_step, config, env))
-    drawn = jax.jit(functools.partial(train_step.environments_at, config, env))
+    drawn = jax.jit(functools.partial(train_step.episodes_at, config, env))
     changes = 0
     for number in range(8):
-        now, then = (drawn(jnp.int32(config.prefill_steps + number + later)) for later in (0, 1))
+        now, then = (drawn(jnp.int32(config.prefill_steps + number + later)).env for later in (0, 1))
         state, _ = step(state)
         ended = np.asarray(state.env_states.steps) == 0
         for leaf in (lambda e: e.model.inertia_B, lambda e: e.ranges.boresight_B, lambda e: e.urgency):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support import oracle
 
-from koz_jax.config.shield import UncertaintyConfig
+from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.task import scenario, uncertainty
 from koz_jax.task.uncertainty import Uncertainty
 
@@ -37,7 +37,7 @@ def test_the_disturbance_has_its_norm_and_any_direction(errors, env):
 @pytest.mark.slow
 def test_noise_has_its_size_and_its_bound_and_spares_the_rest(errors, env):
     state = env.reset(scenario.paper_test())
-    seen = jax.vmap(lambda key: uncertainty.add_sensor_noise(errors, state, key))(KEYS)
+    seen = jax.vmap(lambda key: uncertainty.add_sensor_errors(errors, state, key))(KEYS)
     turned = (oracle.rotation(state.body.q_BN).inv() * oracle.rotation(seen.body.q_BN)).as_rotvec(degrees=True)
     rate = np.rad2deg(np.asarray(seen.body.omega_BN_B) - np.asarray(state.body.omega_BN_B))
     for noise, deviation in ((turned, 0.5), (rate, 0.2)):
@@ -68,3 +68,36 @@ def test_an_environment_flies_its_uncertainty_and_measures_anew_at_every_step(er
     )
     np.testing.assert_array_equal(first, again)
     assert len({tuple(first), tuple(next_step), tuple(elsewhere), tuple(np.asarray(state.body.omega_BN_B))}) == 4
+
+
+def test_a_bias_has_its_norm_stays_for_the_maneuver_and_is_another_in_the_next(env):
+    biased = env.replace(
+        uncertainty=uncertainty.from_config(UncertaintyConfig(attitude_bias_deg=0.5, rate_bias_deg=0.2))
+    )
+    state = env.reset(scenario.paper_test())
+
+    def errors_of(at, key):
+        seen = biased.measure(at, key)
+        turn = (oracle.rotation(at.body.q_BN).inv() * oracle.rotation(seen.body.q_BN)).as_rotvec(degrees=True)
+        return turn, np.rad2deg(np.asarray(seen.body.omega_BN_B) - np.asarray(at.body.omega_BN_B))
+
+    first, later = (errors_of(state.replace(steps=jnp.int32(step)), KEYS[0]) for step in (0, 7))
+    other = errors_of(state, KEYS[1])
+    for one, same, another, norm in zip(first, later, other, (0.5, 0.2), strict=True):
+        np.testing.assert_allclose(one, same, rtol=1e-3, atol=1e-4)
+        assert np.linalg.norm(one) == pytest.approx(norm, rel=1e-3)
+        assert np.linalg.norm(one - another) > 0.01 * norm
+
+
+@pytest.mark.parametrize("delay", [0, 1, 3])
+def test_a_late_torque_is_that_of_an_earlier_step(env, delay):
+    """Every command comes ``delay`` steps late, and before the first arrives there is none."""
+    late = env.replace(uncertainty=uncertainty.from_config(UncertaintyConfig()).replace(delay=jnp.int32(delay)))
+    actions = jax.random.uniform(jax.random.key(1), (8, 3), minval=-1.0, maxval=1.0)
+    state, torques = late.reset(scenario.paper_test()), []
+    step = jax.jit(lambda state, action: late.step(state, action, truth=late.sample_truth(KEYS[0])).state)
+    for action in actions:
+        state = step(state, action)
+        torques.append(np.asarray(state.torque_B))
+    expected = np.concatenate([np.zeros((delay, 3)), 2.0 * np.asarray(actions)])[: len(actions)]
+    np.testing.assert_allclose(torques, expected, rtol=1e-6)

@@ -14,9 +14,10 @@ from koz_jax.cli.flags import parsing
 from koz_jax.cli.flags.parsing import ChangesOf, agents_own, same_as
 from koz_jax.config.base import MarginDeg, NonNegativeFloat, Settings, ZoneCount
 from koz_jax.config.monte_carlo import CaseConfig, MonteCarloConfig
-from koz_jax.config.shield import CERTAIN, ShieldConfig, UncertaintyConfig
+from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.spread import Urgency
 from koz_jax.config.task import ScenarioConfig, TaskConfig
+from koz_jax.config.uncertainty import CERTAIN, UncertaintyConfig
 from koz_jax.control.registry import ADVERSARIAL, CLASSICAL
 
 if TYPE_CHECKING:
@@ -80,7 +81,7 @@ class _RuleFlags(Settings):
     """Fly under the shield, which keeps the boresight out of every zone whatever the controller asks for."""
     shield_margin_deg: MarginDeg = same_as(ShieldConfig, "margin_deg")
     robust: bool = False
-    """Make the shield withstand the errors that are flown with, which the next four flags set."""
+    """Make the shield withstand the errors that are flown with, which the flags of errors set."""
 
 
 class FlightFlags(UncertaintyConfig, _RuleFlags, CaseConfig):

@@ -13,7 +13,7 @@ from koz_jax.cli.flags.flight import FlightFlags
 from koz_jax.config.maneuvers.maneuver import ManeuverConfig
 from koz_jax.config.maneuvers.maneuver_file import load_maneuver
 from koz_jax.config.monte_carlo import CaseConfig, MonteCarloConfig
-from koz_jax.config.shield import CERTAIN, UncertaintyConfig
+from koz_jax.config.uncertainty import CERTAIN, UncertaintyConfig
 
 if TYPE_CHECKING:
     from koz_jax.config.task import TaskConfig

@@ -16,8 +16,8 @@ from koz_jax.config.base import (
     ShareBelowOne,
     Vector,
 )
-from koz_jax.config.shield import UncertaintyConfig
 from koz_jax.config.task import SpacecraftConfig, TorqueLimit
+from koz_jax.config.uncertainty import DelaySteps, UncertaintyConfig
 from koz_jax.errors import explain
 
 # By so much a direction or a quaternion may be longer or shorter than 1; more is a slip of the pen.
@@ -185,13 +185,17 @@ class ErrorsConfig(Table):
     """Standard deviation per axis of the measured attitude [deg]."""
     rate_noise_deg: NonNegativeFloat = 0.0
     """Standard deviation per axis of the measured rate [deg/s]."""
-    delay_steps: Annotated[int, _only_zero("allowed is 0")] = 0
-    """Steps between measurement and torque: not supported yet unless zero."""
+    attitude_bias_deg: NonNegativeFloat = 0.0
+    """Constant error of the measured attitude [deg], about a random axis."""
+    rate_bias_deg: NonNegativeFloat = 0.0
+    """Norm of a constant error of the measured rate [deg/s], its direction random."""
+    delay_steps: DelaySteps = 0
+    """Steps by which the torque comes late."""
 
     @property
     def uncertainty(self) -> UncertaintyConfig:
         """The same as settings of a flight."""
-        values = self.model_dump(exclude={"inertia", "delay_steps"})
+        values = self.model_dump(exclude={"inertia"})
         return UncertaintyConfig(inertia_error=self.inertia, **values)
 
 

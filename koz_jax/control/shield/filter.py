@@ -9,6 +9,7 @@ guide; otherwise the shield brakes, along a path that was found to be clear.
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from koz_jax.config.shield import ShieldConfig
@@ -125,8 +126,11 @@ def from_config(config: ShieldConfig, model: Model) -> Shield:
     errors = config.error_bounds
     limits = model.actuators.limits(model.actuators.initial_state())
     attitude_error, rate_error = (
-        NOISE_BOUND * jnp.sqrt(3.0) * jnp.deg2rad(jnp.float32(deviation))
-        for deviation in (errors.attitude_noise_deg, errors.rate_noise_deg)
+        jnp.deg2rad(jnp.float32(NOISE_BOUND * np.sqrt(3.0) * deviation + bias))
+        for deviation, bias in (
+            (errors.attitude_noise_deg, errors.attitude_bias_deg),
+            (errors.rate_noise_deg, errors.rate_bias_deg),
+        )
     )
     moments = jnp.linalg.eigvalsh(model.inertia_B)
     brake = Brake(

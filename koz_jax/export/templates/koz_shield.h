@@ -4,7 +4,8 @@
  *     @STATED_INERTIA_ERROR@ of the inertia about any axis,
  *     @STATED_DISTURBANCE_TORQUE@ N m of constant torque from outside,
  *     @STATED_ATTITUDE_NOISE_DEG@ deg per axis in the measured attitude (standard deviation, cut at three times that),
- *     @STATED_RATE_NOISE_DEG@ deg/s per axis in the measured rate (likewise).
+ *     @STATED_RATE_NOISE_DEG@ deg/s per axis in the measured rate (likewise),
+ *     @STATED_ATTITUDE_BIAS_DEG@ deg and @STATED_RATE_BIAS_DEG@ deg/s of constant error in what is measured.
  * Leads around a zone at @GUIDE_RATE_DEG@ deg/s, and looks at @SAMPLES@ points of a brake path.
  *
 @HEAD@

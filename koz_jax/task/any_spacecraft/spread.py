@@ -1,4 +1,4 @@
-"""What is drawn anew for every maneuver besides its scenario: the spacecraft, its rate limit, the urgency."""
+"""What is drawn anew for every maneuver besides its scenario: spacecraft, rate limit, urgency, delay."""
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,9 @@ _THINNEST = 0.05
 # Separates the keys of what is drawn here from all others of a maneuver.
 PURPOSE = 0x535052
 
+# Separates the key of the delay from those of the other draws.
+_DELAY = 0x44454C
+
 # Torque limits of the axes differ by at most this factor.
 _UNEQUAL = 2.0
 
@@ -27,8 +30,10 @@ class Spread(struct.PyTreeNode):
     step_shares: jax.Array  # (2,) [T] shortest and longest time step
     max_rates: jax.Array  # (2,) [rad/s]
     urgencies: jax.Array  # (2,)
+    delays: jax.Array  # (2,) int32
     spacecraft: bool = struct.field(pytree_node=False)
     rate_limits: bool = struct.field(pytree_node=False)
+    late: bool = struct.field(pytree_node=False)
 
 
 class Drawn(struct.PyTreeNode):
@@ -37,11 +42,16 @@ class Drawn(struct.PyTreeNode):
     model: Model
     boresight_B: jax.Array  # (3,) unit vector of the instrument
     urgency: jax.Array  # ()
+    delay: jax.Array | None  # () int32; None where it is not spread
 
 
 def draw(spread: Spread, model: Model, boresight_B: jax.Array, key: jax.Array) -> Drawn:
     """Draw for one maneuver; what is not spread is as given.  key: () typed PRNG key."""
     key_body, key_boresight, key_rate, key_urgency = jax.random.split(key, 4)
+    delay = None
+    if spread.late:
+        shortest, longest = spread.delays
+        delay = jax.random.randint(jax.random.fold_in(key, _DELAY), (), shortest, longest + 1)
     if spread.spacecraft:
         model = _sample_body(spread, model, key_body)
         boresight_B = rotations.normalize(jax.random.normal(key_boresight, (3,)))
@@ -49,7 +59,7 @@ def draw(spread: Spread, model: Model, boresight_B: jax.Array, key: jax.Array) -
         low, high = jnp.log(spread.max_rates)
         model = model.replace(max_rate=jnp.exp(jax.random.uniform(key_rate, (), minval=low, maxval=high)))
     low, high = spread.urgencies
-    return Drawn(model, boresight_B, jax.random.uniform(key_urgency, (), minval=low, maxval=high))
+    return Drawn(model, boresight_B, jax.random.uniform(key_urgency, (), minval=low, maxval=high), delay)
 
 
 def _sample_body(spread: Spread, model: Model, key: jax.Array) -> Model:
@@ -80,6 +90,8 @@ def from_config(task: TaskConfig) -> Spread | None:
         step_shares=jnp.array(config.step_shares),
         max_rates=jnp.deg2rad(jnp.array(config.max_rate_deg or (1.0, 1.0))),
         urgencies=jnp.array(config.urgency or (0.5, 0.5)),
+        delays=jnp.array(config.delay_steps or (0, 0)),
         spacecraft=config.spacecraft,
         rate_limits=config.max_rate_deg is not None,
+        late=config.delay_steps is not None,
     )
