@@ -152,9 +152,7 @@ def run_case(
             control_effort=tally.control_effort + stepped.outcome.torque**2 * env.model.dt,
             min_margin=jnp.minimum(tally.min_margin, margin),
             last_unsettled=_last_unsettled(env, stepped.state, tally.last_unsettled),
-            interventions=tally.interventions + stepped.command.intervened,
-            torque_change=tally.torque_change + jnp.linalg.norm(env.nominal_limits.box_B * stepped.command.change),
-            intervened=stepped.command.intervened,
+            **_interventions(env, tally, stepped),
             **_agility(env, tally, stepped),
         ), None
 
@@ -178,6 +176,18 @@ def run_case(
         torque_variation=end.torque_variation,
         unrest=end.unrest,
     )
+
+
+def _interventions(env: Reorientation, tally: _Tally, stepped: Step) -> dict[str, jax.Array]:
+    """How often and how much the filter changed torques, after one more step."""
+    if env.action_filter is None:
+        return {name: getattr(tally, name) for name in ("interventions", "torque_change", "intervened")}
+    changed = stepped.command.intervened
+    return {
+        "interventions": tally.interventions + changed,
+        "torque_change": tally.torque_change + jnp.linalg.norm(env.nominal_limits.box_B * stepped.command.change),
+        "intervened": changed,
+    }
 
 
 def _agility(env: Reorientation, tally: _Tally, stepped: Step) -> dict[str, jax.Array]:
