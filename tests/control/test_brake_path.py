@@ -58,15 +58,11 @@ def _edge_of_the_safe_set(
         jnp.asarray(half_angles[:, None], jnp.float32),
     )
 
-    @jax.jit
-    def safe(rates: jax.Array) -> jax.Array:
-        bodies = RigidBodyState(jnp.asarray(q, jnp.float32), rates[:, None] * jnp.asarray(turns, jnp.float32))
-        return jax.vmap(lambda body, zone: shield.is_safe(made, body, zone, model))(bodies, zones)
-
     low, high = np.zeros(EDGE_STATES), np.full(EDGE_STATES, 1.0)
     for _ in range(24):
         middle = 0.5 * (low + high)
-        passed = np.asarray(safe(jnp.asarray(middle, jnp.float32)))
+        bodies = RigidBodyState(jnp.float32(q), jnp.float32(middle)[:, None] * jnp.float32(turns))
+        passed = np.asarray(_safe(made, model, bodies, zones))
         low, high = np.where(passed, middle, low), np.where(passed, high, middle)
     return q, low[:, None] * turns, axes, half_angles
 
@@ -75,18 +71,35 @@ def _smallest_margins(
     made: Shield, model: Model, q: np.ndarray, omega: np.ndarray, axes: np.ndarray, half_angles: np.ndarray
 ) -> np.ndarray:
     """Margin while the brake works until all are at rest, in double precision, many times a step.  Returns (n,)."""
-    brake = jax.jit(jax.vmap(lambda body: brake_path.torque(made.brake, body, model)))
     inertia, dt = np.asarray(model.inertia_B, np.float64), float(model.dt)
+    q, omega = q.copy(), omega.copy()
     smallest = np.full(len(q), np.inf)
+    moving = np.arange(len(q))
     for _ in range(2000):
-        torques = np.asarray(brake(RigidBodyState(jnp.float32(q), jnp.float32(omega))), np.float64)
+        torques = np.asarray(_brake(made, model, RigidBodyState(jnp.float32(q), jnp.float32(omega))), np.float64)
+        passed = []
         for _ in range(INSTANTS):
-            q, omega = oracle.propagate_many(q, omega, torques, dt / INSTANTS, inertia)
-            looks = oracle.rotation(q).apply(oracle.BORESIGHT)
-            smallest = np.minimum(smallest, oracle.angle_between(looks, axes) - half_angles)
-        if np.linalg.norm(omega, axis=1).max() < 1e-5:
+            now = oracle.propagate_many(q[moving], omega[moving], torques[moving], dt / INSTANTS, inertia)
+            q[moving], omega[moving] = now
+            passed.append(now[0])
+        looks = oracle.rotation(np.concatenate(passed)).apply(oracle.BORESIGHT).reshape(INSTANTS, len(moving), 3)
+        margins = oracle.angle_between(looks, axes[moving]) - half_angles[moving]
+        smallest[moving] = np.minimum(smallest[moving], margins.min(axis=0))
+        # What has come to rest stays where it is.
+        moving = moving[np.linalg.norm(omega[moving], axis=1) >= 1e-5]
+        if not len(moving):
             return smallest
     raise AssertionError("the brake does not come to rest")
+
+
+@jax.jit
+def _safe(made: Shield, model: Model, bodies: RigidBodyState, zones: PointingConstraint) -> jax.Array:
+    return jax.vmap(lambda body, zone: shield.is_safe(made, body, zone, model))(bodies, zones)
+
+
+@jax.jit
+def _brake(made: Shield, model: Model, bodies: RigidBodyState) -> jax.Array:
+    return jax.vmap(lambda body: brake_path.torque(made.brake, body, model))(bodies)
 
 
 @pytest.mark.slow
