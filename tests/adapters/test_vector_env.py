@@ -18,7 +18,7 @@ SHORT = TaskConfig(episode_seconds=2.0)
 
 def vector_state(env, drawn, keys):
     """Environments that fly given scenarios (leaves with a leading axis)."""
-    begun = jax.vmap(env.reset)(drawn)
+    begun = jax.jit(jax.vmap(env.reset))(drawn)
     return VectorState(begun, keys, jnp.zeros(len(keys), jnp.int32), jnp.full(len(keys), jnp.inf))
 
 
@@ -46,7 +46,7 @@ def test_an_episode_is_judged_as_the_monte_carlo_judges_it():
 
     env = Reorientation.from_config(SHORT)
     keys = jax.random.split(jax.random.key(0), 3)
-    drawn = jax.vmap(env.sample)(keys)
+    drawn = jax.jit(jax.vmap(env.sample))(keys)
     # From the target itself the boresight turns towards -y: past a small zone, away from one, towards a far one.
     angles = jnp.deg2rad(jnp.array([[-1.5], [1.5], [-30.0]]))
     drawn = drawn.replace(

@@ -1,8 +1,11 @@
 """A controller of one's own in a file: flown with and without the shield, and refused in a line where it cannot fly."""
 
+import contextlib
 import csv
+import dataclasses
+import io
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -89,33 +92,48 @@ def file(tmp_path) -> Path:
     return path
 
 
-@pytest.mark.slow
-def test_it_is_flown_with_and_without_the_shield(file, agent, empty_cwd, capsys):
-    argv = ["--agent", agent, "--controller", f"{file}:Mine", "--cases", tiny.CASES]
-    assert tiny.status("evaluate", *argv, "--csv", "bare.csv") == 0
-    assert "  Mine\n" in capsys.readouterr().out
-    assert tiny.status("evaluate", *argv, "--shield", "--csv", "shielded.csv") == 0
-    assert "  Mine + shield\n" in capsys.readouterr().out
-    bare, shielded = (list(csv.DictReader((empty_cwd / f"{name}.csv").open())) for name in ("bare", "shielded"))
-    assert {row["intervention_rate"] for row in bare} == {"0"}
-    assert len(shielded) == tiny.CASES and all(float(row["min_margin_deg"]) > 0 for row in shielded)
+class Rows(NamedTuple):
+    """What ``koz evaluate`` printed, and the rows of its file, of the same cases."""
+
+    printed: str
+    cases: list[dict[str, str]]
 
 
-@pytest.mark.slow
-def test_the_shield_keeps_it_out_of_every_zone(file, empty_cwd):
-    argv = ["--controller", f"{file}:Mine", "--cases", tiny.CASES]
-    violated = []
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory) -> dict[str, Rows]:
+    """Whole maneuvers by the file's first class, bare and shielded."""
+    folder = tmp_path_factory.mktemp("own")
+    (folder / "own.py").write_text(MINE)
+    dataclasses.replace(tiny.untrained_agent(), task=TaskConfig()).save(folder / "agent")
+    argv = ["--agent", folder / "agent", "--controller", f"{folder / 'own.py'}:Mine", "--cases", tiny.CASES]
+    found = {}
     for name, flags in (("bare", []), ("shielded", ["--shield"])):
-        assert tiny.status("evaluate", *argv, *flags, "--csv", f"{name}.csv") == 0
-        violated.append(sum(row["violated"] == "1" for row in csv.DictReader((empty_cwd / f"{name}.csv").open())))
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            assert tiny.status("evaluate", *argv, *flags, "--csv", folder / f"{name}.csv") == 0
+        rows = csv.DictReader((folder / f"{name}.csv").read_text().splitlines())
+        found[name] = Rows(printed.getvalue(), list(rows))
+    return found
+
+
+@pytest.mark.slow
+def test_it_is_flown_with_and_without_the_shield(flown):
+    bare, shielded = flown["bare"], flown["shielded"]
+    assert "  Mine\n" in bare.printed and "  Mine + shield\n" in shielded.printed
+    assert {row["intervention_rate"] for row in bare.cases} == {"0"}
+    assert len(shielded.cases) == tiny.CASES and all(float(row["min_margin_deg"]) > 0 for row in shielded.cases)
+
+
+@pytest.mark.slow
+def test_the_shield_keeps_it_out_of_every_zone(flown):
+    violated = [sum(row["violated"] == "1" for row in flown[name].cases) for name in ("bare", "shielded")]
     assert violated[0] > 0 == violated[1]
 
 
 @pytest.mark.slow
 def test_it_can_be_looked_at(file, agent, tmp_path, capsys):
-    argv = ["--agent", agent, "--controller", f"{file}:Mine", "--out"]
+    argv = ["--agent", agent, "--controller", f"{file}:Mine", "--shield", "--out"]
     assert tiny.status("fly", *argv, tmp_path / "figures") == 0
-    assert tiny.status("view", *argv, tmp_path / "page.html", "--shield") == 0
+    assert tiny.status("view", *argv, tmp_path / "page.html") == 0
     assert "Mine + shield: 100.0 deg" in capsys.readouterr().out
     assert "Mine + shield" in (tmp_path / "page.html").read_text()
 
