@@ -89,8 +89,13 @@ def clearance(samples: Samples, zones: PointingConstraint) -> jax.Array:
     return at_points - 0.125 * steps / jnp.tan(jnp.min(present))
 
 
-def fastest_timing(samples: Samples, inertia_B: jax.Array, limit_B: jax.Array) -> Timing:
-    """Time a path as fast as a torque of at most ``limit_B`` (3,) [N m] about each body axis allows."""
+def fastest_timing(
+    samples: Samples, inertia_B: jax.Array, limit_B: jax.Array, max_speed: jax.Array | None = None
+) -> Timing:
+    """Time a path as fast as a torque of at most ``limit_B`` (3,) [N m] about each body axis allows.
+
+    max_speed: (points,) [1/s] largest ds/dt; None for any.
+    """
     # In units in which numbers are of order one, so that the least of them, below, suit every spacecraft.
     inertia, torque = jnp.trace(inertia_B) / 3.0, jnp.sqrt(jnp.mean(limit_B**2))
     inertia_B, limit_B, unit = inertia_B / inertia, limit_B / torque, jnp.sqrt(inertia / torque)
@@ -106,8 +111,11 @@ def fastest_timing(samples: Samples, inertia_B: jax.Array, limit_B: jax.Array) -
     ahead = (0.5 * curved_B + along_B / (2.0 * step)) / limit_B[None]
     back = (0.5 * curved_B - along_B / (2.0 * step)) / limit_B[None]
 
-    def fastest_begin(x_end: jax.Array, rows: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        found = _largest_begin(*rows, x_end)
+    top = jnp.full(pieces, jnp.inf) if max_speed is None else (unit * max_speed[:-1]) ** 2
+
+    def fastest_begin(x_end: jax.Array, rows: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        ahead, back, most = rows
+        found = jnp.minimum(_largest_begin(ahead, back, x_end), most)
         return found, found
 
     def fastest_end(x_begin: jax.Array, rows: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -116,7 +124,7 @@ def fastest_timing(samples: Samples, inertia_B: jax.Array, limit_B: jax.Array) -
         found = jnp.clip(jnp.min(room / jnp.maximum(jnp.abs(ahead), 1e-9)), 1e-9, most)
         return found, found
 
-    _, most = jax.lax.scan(fastest_begin, jnp.zeros(()), (ahead, back), reverse=True)
+    _, most = jax.lax.scan(fastest_begin, jnp.zeros(()), (ahead, back, top), reverse=True)
     limits = jnp.concatenate([most[1:], jnp.zeros(1)])
     _, ends = jax.lax.scan(fastest_end, jnp.zeros(()), (ahead, back, limits))
     speed = jnp.sqrt(jnp.concatenate([jnp.zeros(1), ends]))

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from flax import struct
 
 from koz_jax.control import attitude_path, feedback
-from koz_jax.control.attitude_path import AttitudePath, Timing
+from koz_jax.control.attitude_path import AttitudePath, Samples, Timing
 from koz_jax.control.feedback import Gain
-from koz_jax.task import rotations
+from koz_jax.task import dynamics, rotations
 from koz_jax.task.any_spacecraft import units
 from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.state import EnvState, Model, torque_limits
@@ -31,6 +31,9 @@ _SIDES = 8
 # Standard deviation [rad] of the first sine's amplitude in the first and in the last round; less for further sines.
 _SPREADS = (0.3, 0.03)
 
+
+# Of the rate limit that a plan needs; what is left is for its tracking.
+_RATE_SHARE = 0.97
 
 # Of the error at which the clock begins to slow down; at twice that it stands still.
 _LOST = 3.0
@@ -70,6 +73,15 @@ class _Search(struct.PyTreeNode):
     needed: jax.Array  # () bool
 
 
+def _max_speed(samples: Samples, model: Model) -> jax.Array | None:
+    """Largest ds/dt (points,) [1/s] that the shield would let pass; None without a rate limit."""
+    if model.max_rate is None:
+        return None
+    form_B = dynamics.peak_rate_form(model.inertia_B)
+    squared = jax.vmap(lambda slope_B: rotations.dot(slope_B, dynamics.matvec(form_B, slope_B)))(samples.slope_B)
+    return _RATE_SHARE * model.max_rate / jnp.sqrt(jnp.maximum(squared, 1e-12))
+
+
 class PathPlanner(struct.PyTreeNode):
     """Plans in ``begin``, tracks in ``decide``, and plans anew where something has led it off its path.
 
@@ -96,7 +108,7 @@ class PathPlanner(struct.PyTreeNode):
             path = attitude_path.from_state(state.body, state.scenario.q_DN, bends_B)
             samples = attitude_path.sample(path, self.points)
             clear = attitude_path.clearance(samples, state.scenario.constraints)
-            timing = attitude_path.fastest_timing(samples, model.inertia_B, limit_B)
+            timing = attitude_path.fastest_timing(samples, model.inertia_B, limit_B, _max_speed(samples, model))
             return timing.duration + per_shortfall * jnp.maximum(self.margin - clear, 0.0)
 
         per_shortfall = _TIME_PER_SHORTFALL * units.of(model).time
@@ -104,7 +116,8 @@ class PathPlanner(struct.PyTreeNode):
         bends_B = self._search(cost, self._first_bends(state), key_search)
         path = attitude_path.from_state(state.body, state.scenario.q_DN, bends_B)
         samples = attitude_path.sample(path, self.points)
-        return Plan(path, attitude_path.fastest_timing(samples, model.inertia_B, limit_B), jnp.zeros(()), key)
+        timing = attitude_path.fastest_timing(samples, model.inertia_B, limit_B, _max_speed(samples, model))
+        return Plan(path, timing, jnp.zeros(()), key)
 
     def _search(self, cost: Callable[[jax.Array], jax.Array], first_B: jax.Array, key: jax.Array) -> jax.Array:
         """Cross-entropy search from the best of the first bends (n, sines, 3).  Returns the best found (sines, 3)."""

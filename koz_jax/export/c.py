@@ -10,7 +10,7 @@ from koz_jax.agents.numpy_policy import NumpyPolicy, exported_zone_count
 from koz_jax.config.base import Vector
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import TaskConfig
-from koz_jax.control.shield import brake_path, guide
+from koz_jax.control.shield import brake_path, guide, rate_limit
 from koz_jax.control.shield import filter as shield
 from koz_jax.export import c_network, c_observation, c_text
 from koz_jax.export.golden import EXAMPLE_CASE, Golden
@@ -108,11 +108,14 @@ def _shield_constants(made: shield.Shield, model: Model, metadata: Metadata) -> 
         "GUIDE_AHEAD": guide.AHEAD,
         "SLOW_STEPS": shield.SLOW_STEPS,
         "RAISE": shield.RAISE,
+        "SQUARED_RATE": 1.0 if made.rate_limit is None else made.rate_limit.squared,
+        "RATE_ROUNDING": rate_limit.ROUNDING,
     }
     shares = {"REQUEST_SHARES": shield.REQUEST_SHARES, "GUIDE_SHARES": shield.GUIDE_SHARES}
     return {
         "INERTIA": c_text.matrix(model.inertia_B),
         "INVERSE_INERTIA": c_text.matrix(dynamics.inverse(model.inertia_B)),
+        "RATE_FORM": c_text.matrix(jnp.zeros((3, 3)) if made.rate_limit is None else made.rate_limit.form_B),
         **{f"{name}_COUNT": str(len(values)) for name, values in shares.items()},
         **{name: c_text.row(values) for name, values in shares.items()},
         **{name: c_text.number(float(value)) for name, value in numbers.items()},

@@ -36,6 +36,17 @@ def gyroscopic_torque(omega_BN_B: jax.Array, inertia_B: jax.Array) -> jax.Array:
     return rotations.cross(omega_BN_B, matvec(inertia_B, omega_BN_B))
 
 
+def peak_rate_form(inertia_B: jax.Array) -> jax.Array:
+    """M, with w . M w the square of the largest rate of the torque-free motion through the rate w.  Returns (3, 3).
+
+    With a <= b <= c the principal moments, the squared rate is a linear function of squared momentum and energy where a
+    component of w vanishes.  Every torque-free motion passes where that of b does, and has its largest rate there:
+    M = ((a + c) I - I^2) / (a c).
+    """
+    a, _, c = jnp.linalg.eigvalsh(inertia_B)
+    return ((a + c) * inertia_B - inertia_B @ inertia_B) / (a * c)
+
+
 @jax.jit
 def angular_acceleration(
     omega_BN_B: jax.Array, torque_B: jax.Array, inertia_B: jax.Array, inverse_inertia_B: jax.Array

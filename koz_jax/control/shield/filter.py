@@ -13,9 +13,10 @@ import numpy as np
 from flax import struct
 
 from koz_jax.config.shield import ShieldConfig
-from koz_jax.control.shield import brake_path, guide
+from koz_jax.control.shield import brake_path, guide, rate_limit
 from koz_jax.control.shield.brake_path import Brake
 from koz_jax.control.shield.guide import Guide
+from koz_jax.control.shield.rate_limit import RateLimit
 from koz_jax.task import dynamics, pointing_constraints, rotations
 from koz_jax.task.actuators import TorqueLimits
 from koz_jax.task.dynamics import RigidBodyState
@@ -45,6 +46,7 @@ class Shield(struct.PyTreeNode):
     attitude_error: jax.Array  # () [rad] largest error of a measured attitude
     brake: Brake
     guide: Guide
+    rate_limit: RateLimit | None = None  # None where the spacecraft has none
 
     def covers(self, state: EnvState, model: Model) -> jax.Array:
         """Whether the guarantee holds from this state on: braking keeps the margin.  Returns () bool."""
@@ -72,6 +74,8 @@ class Shield(struct.PyTreeNode):
         """
         situation = brake_path.situation(constraints, model)
         brake_B = brake_path.torque(self.brake, body, model)
+        if self.rate_limit is not None:
+            torque_B = self.rate_limit.limit(body, torque_B, brake_B, model)
         guide_B, away_B = guide.torques(self.guide, self.margin, body, torque_B, constraints, limits, model)
         asked_B = [share * torque_B + (1.0 - share) * guide_B for share in REQUEST_SHARES]
         led_B = [share * guide_B + (1.0 - share) * brake_B for share in GUIDE_SHARES]
@@ -97,7 +101,7 @@ class Shield(struct.PyTreeNode):
             found = brake_path.clearance(self.brake, after, pushed, situation, model, self.margin, needed)
             made = (found >= least) & ((inside >= slack) | (present <= slack)) & (number != _BRAKE)
             # Only away from the zone where there is too little; else a craft at rest would stay where it is.
-            made = made & ((number != _AWAY) | (search.braking < 0.5 * self.margin))
+            made = made & ((number != _AWAY) | (search.braking < 0.5 * self.margin)) & self._keeps_rate(body, after)
             braking = jnp.where(number == _BRAKE, found, search.braking)
             return _Search(jnp.where(made, number, number + 1), made, braking)
 
@@ -105,6 +109,9 @@ class Shield(struct.PyTreeNode):
         begin = _Search(jnp.int32(_REQUEST), jnp.array(False), jnp.float32(jnp.inf))
         end = jax.lax.while_loop(lambda search: ~search.made & (search.number < last), attempt, begin)
         return tried_B[end.number]
+
+    def _keeps_rate(self, before: RigidBodyState, after: RigidBodyState) -> jax.Array:
+        return jnp.array(True) if self.rate_limit is None else self.rate_limit.keeps(before, after)
 
     def _least(self, number: jax.Array, present: jax.Array) -> jax.Array:
         """Clearance that a candidate must have.  present: () [rad] that braking leaves; inf where it does not count."""
@@ -147,6 +154,7 @@ def from_config(config: ShieldConfig, model: Model) -> Shield:
         attitude_error=attitude_error,
         brake=brake,
         guide=guide.from_config(config, brake, limits, model),
+        rate_limit=rate_limit.from_model(model, rate_error),
     )
 
 

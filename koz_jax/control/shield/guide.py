@@ -19,6 +19,9 @@ _RATE_T = 0.574
 # [rad] How far it leads in a time step, at most.
 _ARC = 0.1
 
+# Of a rate limit, which coasting may reach about other axes.
+_RATE_SHARE = 0.5
+
 # A request is taken to act for so many times the guide's own seconds where it is asked to which side it pushes, and
 # what is missing to the margin is made good in as many.
 AHEAD = 2.0
@@ -37,6 +40,8 @@ def from_config(config: ShieldConfig, brake: Brake, limits: TorqueLimits, model:
     unit = jnp.sqrt(jnp.trace(model.inertia_B) / (3.0 * limits.scale))
     wanted = _RATE_T / unit if config.guide_rate_deg is None else jnp.deg2rad(jnp.float32(config.guide_rate_deg))
     rate = jnp.minimum(wanted, _ARC / model.dt)
+    if model.max_rate is not None:
+        rate = jnp.minimum(rate, _RATE_SHARE * model.max_rate)
     e = brake.inertia_error
     return Guide(
         rate=rate,

@@ -38,6 +38,9 @@ static const float slow_steps = @SLOW_STEPS@; /* of the brake, from a state that
 static const float least_gain = @RAISE@; /* [rad] of clearance */
 static const float request_shares[REQUEST_SHARES] = {@REQUEST_SHARES@};
 static const float guide_shares[GUIDE_SHARES] = {@GUIDE_SHARES@};
+static const float rate_form[3][3] = {@RATE_FORM@}; /* w.M w: squared largest rate of free motion; 0: no limit */
+static const float squared_rate = @SQUARED_RATE@; /* [(rad/s)^2] its limit */
+static const float rate_rounding = @RATE_ROUNDING@;
 static const float unbounded = 1e9f; /* [rad] more than any margin */
 
 typedef struct {
@@ -371,15 +374,50 @@ static float clearance_after(const search *at, const float torque_B[3], const bo
     return clearance(at->now, after, pushed, least);
 }
 
+/* Square of the largest rate that the body has if it coasts or brakes from here. */
+static float squared_peak(const float omega_B[3])
+{
+    float slope_B[3];
+    multiply(rate_form, omega_B, slope_B);
+    return koz_dot(omega_B, slope_B);
+}
+
+/* Mix a torque with the brake's, as far as the rate limit needs it. */
+static void limit_rate(const body_state *body, const float brake_B[3], float torque_B[3])
+{
+    body_state asked, braked;
+    float change_B[3], slope_B[3], least, room, square, half, root, share;
+    int i;
+    push(body, torque_B, &asked);
+    push(body, brake_B, &braked);
+    least = squared_peak(braked.omega_BN_B);
+    if (squared_peak(asked.omega_BN_B) <= larger(squared_rate, least)) return;
+    for (i = 0; i < 3; i++) change_B[i] = asked.omega_BN_B[i] - braked.omega_BN_B[i];
+    multiply(rate_form, change_B, slope_B);
+    room = larger(squared_rate - least, 0.0f);
+    square = koz_dot(change_B, slope_B);
+    half = koz_dot(braked.omega_BN_B, slope_B);
+    root = sqrtf(half * half + square * room);
+    if (half > 0.0f)
+        share = room / (half + root);
+    else
+        share = square > 0.0f ? (root - half) / square : 1.0f;
+    share = smaller(share, 1.0f);
+    for (i = 0; i < 3; i++) torque_B[i] = brake_B[i] + share * (torque_B[i] - brake_B[i]);
+}
+
 /* Whether a candidate a share + b (1 - share) can be let through, which it then is: allowed_B. */
 static int passes(
     const search *at, float share, const float a_B[3], const float b_B[3], float least, float allowed_B[3])
 {
     const float slack = attitude_error + rate_error * KOZ_STEP_SECONDS;
     body_state after;
+    float least_peak;
     int i;
     for (i = 0; i < 3; i++) allowed_B[i] = share * a_B[i] + (1.0f - share) * b_B[i];
     push(&at->body, allowed_B, &after);
+    least_peak = larger(squared_rate, squared_peak(at->body.omega_BN_B));
+    if (!(squared_peak(after.omega_BN_B) <= (1.0f + rate_rounding) * least_peak)) return 0;
     if (!(clearance_after(at, allowed_B, &after, least) >= least)) return 0;
     return at->present <= slack || step_clearance(at->now, &at->body, &after, allowed_B) >= slack;
 }
@@ -394,10 +432,11 @@ static void allow(const koz_situation *now, const float requested_B[3], float al
     at.body = body_of(now);
     at.present = unbounded;
     for (i = 0; i < 3; i++) request_B[i] = larger(-@LIMIT_OF_I@, smaller(@LIMIT_OF_I@, requested_B[i]));
+    brake(&at.body, brake_B);
+    limit_rate(&at.body, brake_B, request_B);
     if (passes(&at, 1.0f, request_B, request_B, shield_margin, allowed_B)) return;
 
     nearest = guide(now, &at.body, request_B, around_B, away_B);
-    brake(&at.body, brake_B);
     push(&at.body, brake_B, &after);
     braking = clearance_after(&at, brake_B, &after, -unbounded);
     (void)twice_energy(&at.body, &momentum);
