@@ -23,12 +23,21 @@ from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.spread import SpreadConfig
 from koz_jax.config.task import TaskConfig
+from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.evaluation.cases import fly_cases
 from koz_jax.evaluation.rollout import CaseResult
 from koz_jax.storage import runtime
 
 COLUMNS = ("spacecraft", "urgency", "cases", "success", "violated", "settling time [s]", "effort [N² m² s]")
 COLUMNS += ("error at the end, 99 % [deg]", "rate limit passed", "at rest", "variation of torque [N m]")
+
+# Errors that an engineer would state, the disturbance half a per cent of the torque limit.
+ERRORS = {
+    "errors": UncertaintyConfig(
+        inertia_error=0.1, disturbance_torque=0.01, attitude_noise_deg=0.01, rate_noise_deg=0.001
+    ),
+    "delay_steps": (0, 2),
+}
 
 # A rate limit counts as passed above this factor of it, and a body as at rest below this mean squared action.
 _PASSED, _AT_REST = 1.01, 1e-4
@@ -55,10 +64,15 @@ def trials() -> Iterator[Trial]:
     anyone = SpreadConfig(spacecraft=True)
     yield Trial("random", TaskConfig(spread=anyone), (0.0, 0.25, 0.5, 0.75, 1.0))
     yield Trial("random, shield", TaskConfig(spread=anyone), shielded=True)
+    slender = anyone.model_copy(update={"slenderness": (0.05, 0.1)})
+    yield Trial("random, slender", TaskConfig(spread=slender))
+    yield Trial("random, with errors", TaskConfig(spread=anyone.model_copy(update={**ERRORS})))
     yield Trial("the paper's", TaskConfig(), (0.0, 0.25, 0.5, 0.75, 1.0))
     for limit_deg in (2.0, 5.0, 10.0, 20.0):
         limited = anyone.model_copy(update={"max_rate_deg": (limit_deg, limit_deg)})
-        yield Trial(f"random, at most {limit_deg:g} deg/s", TaskConfig(spread=limited, episode_seconds=200.0))
+        task = TaskConfig(spread=limited, episode_seconds=300.0 if limit_deg < 5.0 else 200.0)
+        yield Trial(f"random, at most {limit_deg:g} deg/s", task)
+        yield Trial(f"random, at most {limit_deg:g} deg/s, shield", task, shielded=True)
 
 
 def cells(trial: Trial, urgency: float, results: CaseResult) -> list[str]:
@@ -89,6 +103,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--agent", default="universal", help="name or folder of an agent for any spacecraft")
     parser.add_argument("--cases", type=int, default=10_000, help="cases of each row")
     parser.add_argument("--seed", type=int, default=1, help="seed of the draw")
+    parser.add_argument("--only", nargs="*", default=[], metavar="WORD", help="rows whose title has one of these words")
     parser.add_argument("--markdown", type=Path, help="write the table with its origin, for docs/results/")
     args = parser.parse_args(argv)
     return exit_status(lambda: _fly_all(args, argv))
@@ -100,6 +115,8 @@ def _fly_all(args: argparse.Namespace, argv: list[str]) -> int:
     lines = [stamp.row(list(COLUMNS)), stamp.row(["---"] * len(COLUMNS))]
     print("\n".join(lines))
     for trial in trials():
+        if args.only and not any(word in trial.title for word in args.only):
+            continue
         shield, substeps = (ShieldConfig(), 5) if trial.shielded else (None, 1)
         config = MonteCarloConfig(cases=args.cases, seed=args.seed, shield=shield, substeps=substeps)
         for urgency in trial.urgencies:

@@ -6,7 +6,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from koz_jax.config.base import PositiveFloat, Settings
+from koz_jax.config.base import Fraction, PositiveFloat, Settings
 from koz_jax.config.uncertainty import CERTAIN, DelaySteps, UncertaintyConfig
 
 Urgency = Annotated[float, Field(ge=0, le=1)]
@@ -18,6 +18,8 @@ class SpreadConfig(Settings):
     spacecraft: bool = False
     """Fly another spacecraft in every maneuver: any shape, any instrument, torque limits that differ by up to a factor
     of 2; the trace of the inertia and the strength of the actuators are the task's."""
+    slenderness: tuple[Fraction, Fraction] | None = None
+    """Smallest over largest second moment of mass of these spacecraft; None draws all three from 0.05 to 1."""
     step_shares: tuple[PositiveFloat, PositiveFloat] = (0.009, 0.05)
     """Time steps of these spacecraft, in units of T = sqrt(J / u)."""
     max_rate_deg: tuple[PositiveFloat, PositiveFloat] | None = None
@@ -32,7 +34,7 @@ class SpreadConfig(Settings):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        for name in ("step_shares", "max_rate_deg", "urgency", "delay_steps"):
+        for name in ("slenderness", "step_shares", "max_rate_deg", "urgency", "delay_steps"):
             limits = getattr(self, name)
             if limits is not None and limits[0] > limits[1]:
                 raise ValueError(f"{name} must be in order; got {limits}")

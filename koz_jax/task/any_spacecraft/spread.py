@@ -31,9 +31,11 @@ class Spread(struct.PyTreeNode):
     max_rates: jax.Array  # (2,) [rad/s]
     urgencies: jax.Array  # (2,)
     delays: jax.Array  # (2,) int32
+    slenderness: jax.Array  # (2,) smallest over largest second moment
     spacecraft: bool = struct.field(pytree_node=False)
     rate_limits: bool = struct.field(pytree_node=False)
     late: bool = struct.field(pytree_node=False)
+    slender: bool = struct.field(pytree_node=False)
 
 
 class Drawn(struct.PyTreeNode):
@@ -70,7 +72,7 @@ def _sample_body(spread: Spread, model: Model, key: jax.Array) -> Model:
     """
     key_shape, key_turn, key_torque, key_step = jax.random.split(key, 4)
     own = units.of(model)
-    second = jax.random.uniform(key_shape, (3,), minval=_THINNEST, maxval=1.0)
+    second = _second_moments(spread, key_shape)
     moments = 1.5 * own.inertia * (1.0 - second / jnp.sum(second))
     turn = rotations.normalize(jax.random.normal(key_turn, (4,)))
     axes = jax.vmap(rotations.rotate, in_axes=(None, 0))(turn, jnp.eye(3))
@@ -79,6 +81,17 @@ def _sample_body(spread: Spread, model: Model, key: jax.Array) -> Model:
     low, high = spread.step_shares
     share = jax.random.uniform(key_step, (), minval=low, maxval=high)
     return model.replace(inertia_B=axes.T @ (moments[:, None] * axes), actuators=TorqueBox(limits), dt=share * own.time)
+
+
+def _second_moments(spread: Spread, key: jax.Array) -> jax.Array:
+    """Second moments of mass along the principal axes, the largest possible 1.  Returns (3,)."""
+    if not spread.slender:
+        return jax.random.uniform(key, (3,), minval=_THINNEST, maxval=1.0)
+    key_smallest, key_middle = jax.random.split(key)
+    low, high = spread.slenderness
+    smallest = jax.random.uniform(key_smallest, (), minval=low, maxval=high)
+    middle = jax.random.uniform(key_middle, (), minval=smallest, maxval=1.0)
+    return jnp.stack([smallest, middle, jnp.ones(())])
 
 
 def from_config(task: TaskConfig) -> Spread | None:
@@ -94,4 +107,6 @@ def from_config(task: TaskConfig) -> Spread | None:
         spacecraft=config.spacecraft,
         rate_limits=config.max_rate_deg is not None,
         late=config.delay_steps is not None,
+        slenderness=jnp.array(config.slenderness or (1.0, 1.0)),
+        slender=config.slenderness is not None,
     )
