@@ -41,7 +41,7 @@ _CHEAPER = {
     'preset("short")': 'preset("smoke")',
     "cases=5_000": "cases=500",
     "cases = 2_000": "cases = 500",
-    "cases=10_000": "cases=1_000",
+    "cases=10_000": "cases=500",
 }
 
 

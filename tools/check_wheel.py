@@ -16,12 +16,13 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 
+# As many cases as an evaluation of that training has: what is compiled for one serves the other.
 COMMANDS = (
     "koz --help",
     "koz agents",
-    "koz evaluate --cases 100",
-    "koz train --preset smoke --cases 100 --run run",
-    "koz evaluate --agent run --cases 100 --shield",
+    "koz evaluate --cases 200",
+    "koz train --preset smoke --cases 200 --run run",
+    "koz evaluate --agent run --cases 200 --shield",
     "koz fly --case 7 --out figures",
     "koz export phase2 --to c --out c",
     "koz view --out view.html",

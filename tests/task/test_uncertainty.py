@@ -6,6 +6,8 @@ from support import oracle
 
 from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.task import scenario, uncertainty
+from koz_jax.task.environment import Reorientation
+from koz_jax.task.state import EnvState, Truth
 from koz_jax.task.uncertainty import Uncertainty
 
 CONFIG = UncertaintyConfig(inertia_error=0.1, disturbance_torque=0.05, attitude_noise_deg=0.5, rate_noise_deg=0.2)
@@ -17,18 +19,27 @@ def errors() -> Uncertainty:
     return uncertainty.from_config(CONFIG)
 
 
-def test_the_true_inertia_is_off_by_the_whole_bound_about_some_axis(errors, env):
-    truth = jax.vmap(lambda key: uncertainty.sample_truth(errors, env.model, key))(KEYS[:50])
+@pytest.fixture(scope="module")
+def truths(errors, env) -> Truth:
+    """A truth for each key, leaves (keys, ...)."""
+    return jax.jit(jax.vmap(lambda key: uncertainty.sample_truth(errors, env.model, key)))(KEYS)
+
+
+@jax.jit
+def step(env: Reorientation, state: EnvState, action: jax.Array) -> EnvState:
+    return env.step(state, action, truth=env.sample_truth(KEYS[0])).state
+
+
+def test_the_true_inertia_is_off_by_the_whole_bound_about_some_axis(truths):
     root = np.linalg.inv(np.linalg.cholesky(oracle.INERTIA))
-    for inertia in np.asarray(truth.inertia_B, np.float64):
+    for inertia in np.asarray(truths.inertia_B[:50], np.float64):
         relative = np.linalg.eigvalsh(root @ inertia @ root.T) - 1.0
         assert np.max(np.abs(relative)) == pytest.approx(0.1, rel=1e-3)
         np.testing.assert_allclose(inertia, inertia.T, atol=1e-4)
 
 
-def test_the_disturbance_has_its_norm_and_any_direction(errors, env):
-    truth = jax.vmap(lambda key: uncertainty.sample_truth(errors, env.model, key))(KEYS)
-    disturbance = np.asarray(truth.disturbance_B)
+def test_the_disturbance_has_its_norm_and_any_direction(truths):
+    disturbance = np.asarray(truths.disturbance_B)
     np.testing.assert_allclose(np.linalg.norm(disturbance, axis=1), 0.05, rtol=1e-5)
     # The mean of 2,000 random directions is 0.58 / sqrt(2000) per axis.
     assert np.max(np.abs(disturbance.mean(axis=0))) < 0.05 * 4 * 0.58 / np.sqrt(2000)
@@ -37,7 +48,7 @@ def test_the_disturbance_has_its_norm_and_any_direction(errors, env):
 @pytest.mark.slow
 def test_noise_has_its_size_and_its_bound_and_spares_the_rest(errors, env):
     state = env.reset(scenario.paper_test())
-    seen = jax.vmap(lambda key: uncertainty.add_sensor_errors(errors, state, key))(KEYS)
+    seen = jax.jit(jax.vmap(lambda key: uncertainty.add_sensor_errors(errors, state, key)))(KEYS)
     turned = (oracle.rotation(state.body.q_BN).inv() * oracle.rotation(seen.body.q_BN)).as_rotvec(degrees=True)
     rate = np.rad2deg(np.asarray(seen.body.omega_BN_B) - np.asarray(state.body.omega_BN_B))
     for noise, deviation in ((turned, 0.5), (rate, 0.2)):
@@ -95,9 +106,8 @@ def test_a_late_torque_is_that_of_an_earlier_step(env, delay):
     late = env.replace(uncertainty=uncertainty.from_config(UncertaintyConfig()).replace(delay=jnp.int32(delay)))
     actions = jax.random.uniform(jax.random.key(1), (8, 3), minval=-1.0, maxval=1.0)
     state, torques = late.reset(scenario.paper_test()), []
-    step = jax.jit(lambda state, action: late.step(state, action, truth=late.sample_truth(KEYS[0])).state)
     for action in actions:
-        state = step(state, action)
+        state = step(late, state, action)
         torques.append(np.asarray(state.torque_B))
     expected = np.concatenate([np.zeros((delay, 3)), 2.0 * np.asarray(actions)])[: len(actions)]
     np.testing.assert_allclose(torques, expected, rtol=1e-6)
