@@ -358,7 +358,8 @@ def test_the_filter_knows_what_is_measured_and_not_what_is(start, env):
             return measured.body.omega_BN_B
 
     shown = start.replace(body=start.body.replace(omega_BN_B=jnp.array([0.1, 0.2, 0.3])))
-    stepped = env.replace(action_filter=Turn()).step(start, jnp.zeros(3), measured=shown)
+    turning = env.replace(action_filter=Turn())
+    stepped = jax.jit(lambda measured: turning.step(start, jnp.zeros(3), measured=measured))(shown)
     np.testing.assert_allclose(stepped.command.applied, [0.1, 0.2, 0.3], rtol=1e-6)
 
 
@@ -420,7 +421,7 @@ def test_deviations_that_cannot_be_are_refused(angles, message):
 
 def test_a_rule_of_ones_own_may_draw_where_no_zone_fits():
     rule = SamplingRule("resample", max_draws=2)
-    state = Reorientation.from_config(TaskConfig(), 0.0, 20.0, rule=rule).reset(jax.random.key(0))
+    state = jax.jit(Reorientation.from_config(TaskConfig(), 0.0, 20.0, rule=rule).reset)(jax.random.key(0))
     assert state.scenario.constraints.half_angle[0] < 0.0
 
 
@@ -463,7 +464,7 @@ def test_a_step_with_autoreset_is_a_step_and_a_reset_where_time_is_up(short):
 
     expected = jax.tree.map(chosen, fresh, plain.state)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6), found.state, expected)
-    observed = chosen(np.asarray(jax.vmap(short.observe)(fresh)), np.asarray(plain.observation))
+    observed = chosen(np.asarray(jax.jit(jax.vmap(short.observe))(fresh)), np.asarray(plain.observation))
     np.testing.assert_allclose(found.observation, observed, atol=1e-6)
     assert np.all(np.abs(found.observation - found.final_observation)[over].max(axis=1) > 0.01)
 
@@ -480,17 +481,12 @@ def test_where_no_episode_ends_nothing_is_drawn(short):
 @pytest.mark.slow
 def test_autoreset_brings_fresh_scenarios_of_the_range_for_ever(short):
     """Twelve episodes of four environments: 48 starts, no two alike, all as the ranges say."""
-
-    @jax.jit
-    def fly(env: Reorientation, states: EnvState) -> tuple[jax.Array, jax.Array]:
-        def advance(states: EnvState, key: jax.Array) -> tuple[EnvState, tuple[jax.Array, jax.Array]]:
-            keys = jax.random.split(key, ENVS)
-            stepped = env.step_autoreset(states, jnp.ones((ENVS, 3)), lambda: keys)
-            return stepped.state, (stepped.state.scenario.initial.q_BN, stepped.truncated)
-
-        return jax.lax.scan(advance, states, jax.random.split(jax.random.key(2), 55))[1]
-
-    starts, over = map(np.asarray, fly(short, reset_all(short, jax.random.split(jax.random.key(0), ENVS))))
+    states, rows = reset_all(short, jax.random.split(jax.random.key(0), ENVS)), []
+    for key in jax.random.split(jax.random.key(2), 55):
+        stepped = step_autoreset(short, states, jnp.ones((ENVS, 3)), jax.random.split(key, ENVS))
+        states = stepped.state
+        rows.append((states.scenario.initial.q_BN, stepped.truncated))
+    starts, over = map(np.array, zip(*rows, strict=True))
     np.testing.assert_array_equal(np.flatnonzero(over[:, 0]), np.arange(4, 55, 5))
     fresh = starts[over]
     assert len(fresh) == 44 and len(np.unique(fresh, axis=0)) == 44
@@ -505,7 +501,7 @@ def test_autoreset_brings_fresh_scenarios_of_the_range_for_ever(short):
 def test_the_model_has_nothing_of_the_truth():
     """What is uncertain is in ``Truth`` alone: whoever is given a ``Model`` cannot be told a disturbance."""
     assert set(Model.__dataclass_fields__) == {"inertia_B", "actuators", "dt", "max_rate"}
-    assert set(Truth.__dataclass_fields__) == {"inertia_B", "disturbance_B"}
+    assert set(Truth.__dataclass_fields__) == {"inertia_B", "disturbance_B", "delay"}
 
 
 def test_the_model_is_that_of_the_settings():
