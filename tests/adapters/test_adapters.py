@@ -189,7 +189,7 @@ def test_a_seed_gives_the_same_flight_again_and_another_seed_another(adapter):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [ReorientationEnv, ReorientationVectorEnv, lambda: ReorientationVecEnv(2)])
+@pytest.mark.parametrize("make", [ReorientationEnv, ReorientationVectorEnv, lambda: ReorientationVecEnv(ENVS)])
 def test_without_a_seed_every_environment_object_flies_something_else(make):
     def first(made):
         begun = made.reset()
@@ -221,7 +221,7 @@ def test_every_adapter_shows_all_the_zones_that_a_scenario_can_have():
     assert ReorientationVectorEnv(2, several).observation_space.shape == (2, size)
     assert ReorientationVecEnv(2, several).observation_space.shape == (size,)
     assert envs.get_environment(ENV_NAME, task=several).observation_size == size
-    assert NumpyVectorEnv(3, several).reset([0, 1, 2]).shape == (3, size)
+    assert NumpyVectorEnv(1, several).reset([0]).shape == (1, size)
 
 
 def imports_of(path):

@@ -31,10 +31,10 @@ from koz_jax.errors import SettingsError
 import jax.numpy as jnp
 from koz_jax.adapters.sb3_env import ReorientationVecEnv
 from koz_jax.adapters.brax_env import ReorientationEnv
-begun = ReorientationVecEnv(2)
+begun = ReorientationVecEnv(3)
 begun.reset()
 def flies():
-    for use in (lambda: ReorientationVecEnv(2).reset(), ReorientationEnv, lambda: begun.step([[0.0] * 3] * 2)):
+    for use in (lambda: ReorientationVecEnv(3).reset(), ReorientationEnv, lambda: begun.step([[0.0] * 3] * 3)):
         try: use()
         except SettingsError as error: print("spawn" in str(error), flush=True)
 child = multiprocessing.get_context("fork").Process(target=flies)

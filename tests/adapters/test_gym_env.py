@@ -61,7 +61,7 @@ def test_a_sequence_of_seeds_gives_each_environment_its_own():
 
 
 def test_seeds_may_be_numbers_of_numpy_but_no_fractions():
-    env, envs = ReorientationEnv(TASK), ReorientationVectorEnv(2, TASK)
+    env, envs = ReorientationEnv(TASK), ReorientationVectorEnv(3, TASK)
     numpy_seed: Any = np.int64(4)
     fraction: Any = 1.5
     np.testing.assert_array_equal(envs.reset(seed=numpy_seed)[0][0], env.reset(seed=4)[0])

@@ -63,10 +63,10 @@ def test_the_next_episode_is_drawn_again():
     env.reset(seed=4, options=OWN)
     plain.reset(seed=4)
     np.testing.assert_array_equal(env.reset()[0], plain.reset()[0])
-    many, single = ReorientationVectorEnv(2, TASK), ReorientationEnv(TASK)
+    many, single = ReorientationVectorEnv(3, TASK), ReorientationEnv(TASK)
     many.reset(seed=4, options=OWN)
     for _ in range(TASK.episode_steps):
-        observed, _, _, over, _ = many.step(np.zeros((2, 3), np.float32))
+        observed, _, _, over, _ = many.step(np.zeros((3, 3), np.float32))
     assert over.all()
     single.reset(seed=4)
     np.testing.assert_allclose(observed[0], single.reset()[0], rtol=1e-6, atol=1e-6)

@@ -48,22 +48,29 @@ def test_log_prob_is_the_change_of_variables():
     np.testing.assert_allclose(action, expected, atol=1e-6)
 
 
+@jax.jit
+def _sampled(mean, log_std, key):
+    """A sample, and the gradient of its logarithmic density in the mean."""
+
+    def log_density(mean):
+        action, log_prob = SquashedGaussian(mean, log_std).sample(key)
+        return jnp.sum(log_prob), (action, log_prob)
+
+    slope, (action, log_prob) = jax.grad(log_density, has_aux=True)(mean)
+    return action, log_prob, slope
+
+
 @pytest.mark.parametrize("raw", [-80.0, -15.0, 15.0, 80.0])
 def test_log_prob_and_its_gradient_where_the_action_saturates(raw):
     key = jax.random.key(5)
     log_std = jnp.full((4, 3), -6.0)
-
-    @jax.jit
-    def slope(mean):
-        return jax.grad(lambda m: jnp.sum(SquashedGaussian(m, log_std).sample(key)[1]))(mean)
-
     mean = jnp.full((4, 3), raw)
-    action, log_prob = SquashedGaussian(mean, log_std).sample(key)
+    action, log_prob, slope = _sampled(mean, log_std, key)
     np.testing.assert_array_equal(np.abs(action), 1.0)  # in float32 the action itself has lost all of raw
     expected = log_prob_float64(mean, log_std, jax.random.normal(key, (4, 3)))
     np.testing.assert_allclose(log_prob, expected, rtol=1e-5)
     # d/draw of -log(1 - tanh(raw)^2) is 2 tanh(raw).
-    np.testing.assert_allclose(slope(mean), 2.0 * np.sign(raw), rtol=1e-5)
+    np.testing.assert_allclose(slope, 2.0 * np.sign(raw), rtol=1e-5)
 
 
 def test_mode_is_tanh_of_the_mean_whatever_the_deviation():
@@ -178,14 +185,15 @@ def test_dials_modulate_every_layer_and_begin_as_none():
     """Weights of gains are zero at first: the layers then are those of a network that sees the features beside."""
     policy = Policy((8, 8), (), 2, DIALS)
     observed = jax.random.normal(jax.random.key(1), (5, 4))
-    params: Any = policy.init(jax.random.key(0), observed)
+    params: Any = jax.jit(policy.init)(jax.random.key(0), observed)
     layers = params["params"]["Mlp_0"]
     gains = {name: np.asarray(layer["kernel"]) for name, layer in layers.items() if name.startswith("Gain")}
     assert set(gains) == {"Gain_0", "Gain_1"} and not any(gain.any() for gain in gains.values())
 
-    def mean(opened: Any) -> np.ndarray:
+    @jax.jit
+    def mean(opened: Any) -> jax.Array:
         found: Any = policy.apply(opened, observed)
-        return np.asarray(found.mean)
+        return found.mean
 
     opened = jax.tree_util.tree_map_with_path(lambda path, leaf: leaf + 0.3 if "Gain" in str(path) else leaf, params)
     assert not np.allclose(mean(params), mean(opened))
