@@ -1,15 +1,15 @@
 """Training on several devices, in one process or in several: the same as on one up to rounding."""
 
 import itertools
-import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny
-from support.tiny import CONFIG
+from support.tiny import CONFIG, UNREFINED
 
 from koz_jax.errors import SettingsError
 from koz_jax.learning import train_step
@@ -22,20 +22,22 @@ from koz_jax.storage import archive, pytrees
 STEPS = 4
 ONE_CASE = ["--devices", 2, "--cases", 1]
 
-# Some steps on four devices, from the state that one device begins with; then a whole run.
+# Some steps on four devices, from the state that one device begins with; then a whole run, begun on one device too.
 TRAIN = """
 import sys, pathlib
 import jax, jax.numpy as jnp
-from support.tiny import CONFIG, UNREFINED
+from support.tiny import UNREFINED
 from koz_jax.learning import train_step
-from koz_jax.runs import sharding
+from koz_jax.runs import checkpoint, sharding
+from koz_jax.runs.folder import RunFolder
 from koz_jax.runs.trainer import train
 from koz_jax.storage import archive
 assert jax.local_device_count() == 4
 folder = pathlib.Path(sys.argv[1])
-state = sharding.place(train_step.init(CONFIG, jax.random.key(0)), 4)
+begun = archive.load_tree(RunFolder(folder / "run").checkpoint(0), checkpoint.template(UNREFINED))
+state = sharding.place(begun.train, 4)
 for _ in range(2):
-    state, metrics = train_step.train_chunk(CONFIG, state, jnp.int32(int(sys.argv[2])))
+    state, metrics = train_step.train_chunk(UNREFINED, state, jnp.int32(int(sys.argv[2])))
     placed = sharding.place(state, 4)
     assert all(one is other for one, other in zip(*map(jax.tree.leaves, (placed, state)), strict=True))  # at no cost
     for leaf in (state.buffer.rows.observation, state.buffer.rows.truncated, state.env_states.body.q_BN):
@@ -44,14 +46,36 @@ for _ in range(2):
         assert sum(shard.data.size for shard in shards) == leaf.size  # divided, not copied
 assert train_step.train_chunk._cache_size() == 1
 archive.save_tree(folder / "state", (state, metrics), {})
-assert train(UNREFINED, folder / "run", progress=False, devices=4) is not None
+assert train(UNREFINED, folder / "run", resume=True, progress=False, devices=4) is not None
 """
+
+# Runs train.py, and sends the second of two processes a signal in the second phase.
+DRIVER = """
+import os, runpy, signal, sys
+from koz_jax.runs.progress import Progress
+sys.argv = sys.argv[1:]
+advance = Progress.advance
+def advance_and_signal(bar, done):
+    advance(bar, done)
+    if done == 80 and sys.argv[-2:] == ["--process", "1"]:
+        os.kill(os.getpid(), signal.SIGTERM)
+Progress.advance = advance_and_signal
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+def interrupted(*_: Any) -> None:
+    raise KeyboardInterrupt
 
 
 @pytest.fixture(scope="module")
 def four(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What four devices have come to."""
     folder = tmp_path_factory.mktemp("four")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train_step, "train_chunk", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            train(UNREFINED, folder / "run", progress=False)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=4")
         done = tiny.run_python("-c", TRAIN, folder, STEPS, cwd=tiny.ROOT / "tests")
@@ -91,24 +115,13 @@ def test_a_run_on_four_devices_is_like_that_on_one(four):
     assert_like_the_run_on_one_device(RunFolder(four / "run"))
 
 
-def rows(folder: RunFolder) -> int:
-    """Rows of a log that may be being written."""
-    path = folder.path / "metrics.csv"
-    return path.read_text().count("\n") - 1 if path.exists() else 0
-
-
 @pytest.mark.slow
 def test_two_processes_of_two_devices_train_as_one_device(tmp_path):
     folder = RunFolder(tmp_path / "run")
-    # Long enough to be stopped in the second phase, to which the best learner of the first one is handed on.
-    changes = ["--refine.iterations", 0, "--curriculum.phase2.updates", 400]
-    workers = tiny.begin_two("train.py", *tiny.FLAGS, *changes, *ONE_CASE, "--run", folder.path)
-    deadline = time.monotonic() + 200
-    while rows(folder) < 5 and all(worker.poll() is None for worker in workers) and time.monotonic() < deadline:
-        time.sleep(0.01)
-    workers[1].terminate()  # one is told, both stop
-    assert "stopped; go on with" in tiny.ended(workers, 0, 0)[0]
-    assert 5 <= rows(folder) < 29
+    begin = ["-c", DRIVER, "train.py", *tiny.FLAGS, "--refine.iterations", 0, *ONE_CASE, "--run", folder.path]
+    # One is told, both stop: in the second phase, to which the best learner of the first one was handed on.
+    assert "stopped; go on with" in tiny.ended(tiny.begin_two(*begin), 0, 0)[0]
+    assert [int(row["updates"]) for row in read_metrics(folder.path / "metrics.csv")] == [16, 32, 48, 64, 80]
     # One device goes on from there.
     assert train(folder.read_config(), folder.path, resume=True, progress=False) is not None
     assert_like_the_run_on_one_device(folder)
