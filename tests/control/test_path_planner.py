@@ -19,34 +19,40 @@ from koz_jax.task.state import begin
 def drawn_with_zones(count, zones):
     config = TaskConfig.model_validate({"scenario": {"min_zones": 1, "max_zones": zones}})
     draw = MonteCarloConfig(cases=count, seed=2)
-    return jax.vmap(lambda i: cases.draw_case(config, draw, i))(jnp.arange(count))
+    return jax.jit(jax.vmap(lambda i: cases.draw_case(config, draw, i)))(jnp.arange(count))
 
 
 # Start and target keep 2 deg (0.035 rad) from the zones, so no plan can keep more.
 PLANNER = PathPlanner(margin=0.03)
 
 
-def planned(model):
-    """Cases with one to three zones, and the plans for them."""
-    drawn = drawn_with_zones(200, 3)
-
-    def plan(case, key):
-        return PLANNER.begin(begin(case, model), model, key)
-
-    return drawn, jax.jit(jax.vmap(plan))(drawn, jax.random.split(jax.random.key(1), 200))
+COUNT = 100
 
 
 @pytest.fixture(scope="module")
-def plans():
-    """Two hundred cases with one to three zones, and the plans for them."""
-    return planned(MODEL)
+def drawn():
+    """Cases with one to three zones."""
+    return drawn_with_zones(COUNT, 3)
+
+
+@jax.jit
+def _plan(drawn, model):
+    def plan(case, key):
+        return PLANNER.begin(begin(case, model), model, key)
+
+    return jax.vmap(plan)(drawn, jax.random.split(jax.random.key(1), COUNT))
+
+
+@pytest.fixture(scope="module")
+def plans(drawn):
+    return drawn, _plan(drawn, MODEL)
 
 
 @pytest.mark.slow
 def test_planned_paths_stay_clear_of_all_zones(plans):
     drawn, found = plans
     samples = jax.jit(jax.vmap(lambda path: attitude_path.sample(path, 1001)))(found.path)
-    look = jax.vmap(jax.vmap(rotations.rotate, in_axes=(0, None)), in_axes=(0, None))
+    look = jax.jit(jax.vmap(jax.vmap(rotations.rotate, in_axes=(0, None)), in_axes=(0, None)))
     looks_N = np.asarray(look(samples.q_BN, LOOK), float)
     cosines = np.einsum("cpi,czi->cpz", looks_N, np.asarray(drawn.constraints.axis_N, float))
     margins = np.arccos(np.clip(cosines, -1, 1)) - np.asarray(drawn.constraints.half_angle, float)[:, None]
@@ -57,8 +63,7 @@ def test_planned_paths_stay_clear_of_all_zones(plans):
 @pytest.mark.slow
 def test_plans_begin_at_the_start_and_end_at_rest_at_the_target(plans):
     drawn, found = plans
-    begin = jax.vmap(lambda plan: plan.reference(jnp.float32(0.0), jnp.float32(1.0)))(found)
-    end = jax.vmap(lambda plan: plan.reference(plan.timing.duration + 1.0, jnp.float32(1.0)))(found)
+    begin, end = _both_ends(found)
     np.testing.assert_allclose(begin.q_BN, drawn.initial.q_BN, atol=1e-6)
     # The sign too: the maneuver ends at +1.
     np.testing.assert_allclose(end.q_BN, drawn.q_DN, atol=1e-5)
@@ -76,19 +81,26 @@ def test_plans_need_no_more_torque_than_there_is(plans):
 
 
 @pytest.mark.slow
-def test_plans_for_unequal_limits_use_each_of_them():
+def test_plans_for_unequal_limits_use_each_of_them(drawn):
     limits = np.array([0.7, 2.0, 1.2])
-    drawn, found = planned(MODEL.replace(actuators=TorqueBox(jnp.array(limits, jnp.float32))))
+    found = _plan(drawn, MODEL.replace(actuators=TorqueBox(jnp.array(limits, jnp.float32))))
     shares = np.abs(needed_torques(found)) / limits
     assert np.mean(shares.max(axis=2) > 1.1) < 0.01
     assert np.mean(shares.max(axis=2) > 0.9) > 0.8
     assert np.all(np.mean(shares > 0.9, axis=(0, 1)) > 0.05)
-    end = jax.vmap(lambda plan: plan.reference(plan.timing.duration + 1.0, jnp.float32(1.0)))(found)
+    _, end = _both_ends(found)
     np.testing.assert_allclose(end.q_BN, drawn.q_DN, atol=1e-5)
 
 
-def needed_torques(found):
-    """Torques (plans, 97, 3) [N m] along plans: the rate, differentiated."""
+@jax.jit
+@jax.vmap
+def _both_ends(plan):
+    return tuple(plan.reference(time, jnp.float32(1.0)) for time in (jnp.float32(0.0), plan.timing.duration + 1.0))
+
+
+@jax.jit
+def _changes(plans):
+    """Accelerations and rates (plans, 97, 3) along plans."""
     h = 0.02
 
     def torque(plan, share):
@@ -97,7 +109,12 @@ def needed_torques(found):
         return (after - before) / (2 * h), now
 
     shares = jnp.linspace(0.02, 0.98, 97)
-    acceleration, omega = jax.jit(jax.vmap(jax.vmap(torque, in_axes=(None, 0)), in_axes=(0, None)))(found, shares)
+    return jax.vmap(jax.vmap(torque, in_axes=(None, 0)), in_axes=(0, None))(plans, shares)
+
+
+def needed_torques(found):
+    """Torques (plans, 97, 3) [N m] along plans: the rate, differentiated."""
+    acceleration, omega = _changes(found)
     inertia_B, omega = np.asarray(MODEL.inertia_B, float), np.asarray(omega, float)
     momentum = omega @ inertia_B
     return np.asarray(acceleration, float) @ inertia_B + np.cross(omega, momentum)
