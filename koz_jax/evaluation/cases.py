@@ -220,7 +220,7 @@ def fly_scenario(
 
 @jax.jit
 def _keep_and_evaluate(flight: _Flight, drawn: Scenario, key: jax.Array) -> tuple[History, CaseResult]:
-    return rollout.fly(flight.env, flight.controller, drawn, key), flight.evaluate(drawn, key)
+    return rollout.fly_and_judge(flight.env, flight.controller, drawn, flight.substeps, key)
 
 
 def within_steps(history: History, task: TaskConfig, config: MonteCarloConfig, case: int = 0) -> RigidBodyState:

@@ -76,8 +76,8 @@ class _Tally(struct.PyTreeNode):
     unrest: jax.Array
 
 
-def _take_off(env: Reorientation, controller: Controller, drawn: Scenario, key: jax.Array) -> _Flight:
-    key_controller, key_truth, key_noise = _split(key)
+def _take_off(env: Reorientation, controller: Controller, drawn: Scenario, key: jax.Array | None) -> _Flight:
+    key_controller, key_truth, key_noise = _split(jax.random.key(0) if key is None else key)
     state = env.reset(drawn)
     memory = controller.begin(state, env.model, key_controller)
     return _Flight(state, memory, env.sample_truth(key_truth), key_noise)
@@ -141,26 +141,53 @@ def run_case(
         substeps: the zone is checked at so many instants per step; 1 checks at the steps only.
         key: () typed PRNG key of what is random in the controller and in the truth.
     """
-    start = _take_off(env, controller, drawn, jax.random.key(0) if key is None else key)
+    start = _take_off(env, controller, drawn, key)
 
     def advance(tally: _Tally, _: None) -> tuple[_Tally, None]:
-        flight, stepped = _step(env, controller, tally.flight)
-        margin = _smallest_margin(env, tally.flight, stepped, substeps)
-        return _Tally(
-            flight=flight,
-            reward_terms=jax.tree.map(jnp.add, tally.reward_terms, stepped.terms),
-            control_effort=tally.control_effort + stepped.outcome.torque**2 * env.model.dt,
-            min_margin=jnp.minimum(tally.min_margin, margin),
-            last_unsettled=_last_unsettled(env, stepped.state, tally.last_unsettled),
-            **_interventions(env, tally, stepped),
-            **_agility(env, tally, stepped),
-        ), None
+        return _add_step(env, controller, substeps, tally), None
 
     end, _ = jax.lax.scan(advance, _first_tally(env, start), None, length=env.episode_steps)
+    return _judge(env, start.state, end)
+
+
+def fly_and_judge(
+    env: Reorientation, controller: Controller, drawn: Scenario, substeps: int = 1, key: jax.Array | None = None
+) -> tuple[History, CaseResult]:
+    """Fly one maneuver as ``run_case`` does, judge it, and keep everything."""
+    start = _take_off(env, controller, drawn, key)
+
+    def advance(tally: _Tally, _: None) -> tuple[_Tally, EnvState]:
+        return _add_step(env, controller, substeps, tally), tally.flight.state
+
+    end, before = jax.lax.scan(advance, _first_tally(env, start), None, length=env.episode_steps)
+    return _history(env, before, end.flight.state), _judge(env, start.state, end)
+
+
+def fly(env: Reorientation, controller: Controller, drawn: Scenario, key: jax.Array | None = None) -> History:
+    """Fly one maneuver as ``run_case`` does, and keep everything."""
+    return fly_and_judge(env, controller, drawn, key=key)[0]
+
+
+def _add_step(env: Reorientation, controller: Controller, substeps: int, tally: _Tally) -> _Tally:
+    """Fly one more step, and count it."""
+    flight, stepped = _step(env, controller, tally.flight)
+    margin = _smallest_margin(env, tally.flight, stepped, substeps)
+    return _Tally(
+        flight=flight,
+        reward_terms=jax.tree.map(jnp.add, tally.reward_terms, stepped.terms),
+        control_effort=tally.control_effort + stepped.outcome.torque**2 * env.model.dt,
+        min_margin=jnp.minimum(tally.min_margin, margin),
+        last_unsettled=_last_unsettled(env, stepped.state, tally.last_unsettled),
+        **_interventions(env, tally, stepped),
+        **_agility(env, tally, stepped),
+    )
+
+
+def _judge(env: Reorientation, start: EnvState, end: _Tally) -> CaseResult:
     # What is not finite is never a success: a comparison with nan is false.
     settled = (end.last_unsettled < env.episode_steps) & jnp.isfinite(end.min_margin)
     return CaseResult(
-        initial_angle=start.state.angle,
+        initial_angle=start.angle,
         reward_terms=end.reward_terms,
         settling_time=jnp.where(settled, (end.last_unsettled + 1) * env.model.dt, jnp.nan),
         control_effort=end.control_effort,
@@ -171,7 +198,7 @@ def run_case(
         intervention_rate=end.interventions / env.episode_steps,
         mean_torque_change=end.torque_change / env.episode_steps,
         deadlocked=~settled & end.intervened,
-        unsafe_start=~(env.covers(start.state) & (env.margin(start.state) > 0.0)),
+        unsafe_start=~(env.covers(start) & (env.margin(start) > 0.0)),
         peak_rate=end.peak_rate,
         torque_variation=end.torque_variation,
         unrest=end.unrest,
@@ -207,15 +234,9 @@ def _last_steps(env: Reorientation) -> int:
     return max(env.episode_steps // 5, 1)
 
 
-def fly(env: Reorientation, controller: Controller, drawn: Scenario, key: jax.Array | None = None) -> History:
-    """Fly one maneuver, the same as ``run_case`` does with the same key, and keep everything."""
-    start = _take_off(env, controller, drawn, jax.random.key(0) if key is None else key)
-
-    def advance(flight: _Flight, _: None) -> tuple[_Flight, EnvState]:
-        return _step(env, controller, flight)[0], flight.state
-
-    end, before = jax.lax.scan(advance, start, None, length=env.episode_steps)
-    states = jax.tree.map(lambda rows, last: jnp.concatenate([rows, last[None]]), before, end.state)
+def _history(env: Reorientation, before: EnvState, end: EnvState) -> History:
+    """before: leaves (steps, ...), the state before each step; end: the state after the last."""
+    states = jax.tree.map(lambda rows, last: jnp.concatenate([rows, last[None]]), before, end)
     # A state holds the torque that led to it, so the torque applied from an instant on is that of the next state.
     applied_B = jnp.concatenate([states.torque_B[1:], states.torque_B[-1:]])
     return History(

@@ -134,7 +134,8 @@ def test_substeps_reach_the_flight(monkeypatch):
     def seen(*arguments: Any) -> None:
         raise InterruptedError((arguments[0].episode_steps, arguments[3]))
 
-    monkeypatch.setattr(cases.rollout, "run_case", seen)
+    for name in ("run_case", "fly_and_judge"):
+        monkeypatch.setattr(cases.rollout, name, seen)
     with pytest.raises(InterruptedError, match=r"\(20, 3\)"):
         cases.fly_cases(AGENT.controller, AGENT.task, MonteCarloConfig(cases=CASES, seed=SEED, substeps=3))
     with pytest.raises(InterruptedError, match=r"\(20, 4\)"):
