@@ -476,8 +476,18 @@ def test_what_an_episode_meets_is_the_same_through_it_and_another_in_each():
     assert state.on_the_way is not None and state.on_the_way.shape == (config.num_envs, 3, 3)
 
 
-def test_every_episode_has_a_spacecraft_of_its_own():
+def _without_learning(sac, learner, *arguments):
+    """In place of an update: the same learner.  The gradients are what takes long to compile."""
+    metrics = jax.eval_shape(functools.partial(_UPDATE, sac), learner, *arguments)[1]
+    return learner, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), metrics)
+
+
+_UPDATE = sac_learner.update
+
+
+def test_every_episode_has_a_spacecraft_of_its_own(monkeypatch):
     """Environments are drawn anew exactly where their episode ends, and each differently."""
+    monkeypatch.setattr(train_step.sac_learner, "update", _without_learning)
     spread = CONFIG.task.model_copy(update={"spread": SpreadConfig(spacecraft=True, urgency=(0.0, 1.0))})
     network = CONFIG.network.model_copy(update={"scaled": True})
     config = CONFIG.model_copy(update={"task": spread, "network": network, "training_episode_seconds": 2.0})
