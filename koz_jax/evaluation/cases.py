@@ -118,7 +118,12 @@ def draw_case(task: TaskConfig, config: MonteCarloConfig, case: jax.Array | int)
 
     """
     check_feasible(task, config.max_angle_deg)
-    return _of_case(environment(task, config), _key(config), case, None).sample(jax.random.fold_in(_key(config), case))
+    return _draw(environment(task, config), _key(config), jnp.int32(case))
+
+
+@jax.jit
+def _draw(env: Reorientation, key: jax.Array, case: jax.Array) -> Scenario:
+    return _of_case(env, key, case, None).sample(jax.random.fold_in(key, case))
 
 
 @functools.partial(jax.jit, static_argnames="mesh")

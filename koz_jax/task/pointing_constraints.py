@@ -41,7 +41,7 @@ def absent(count: int, boresight_B: jax.Array) -> PointingConstraint:
     return PointingConstraint(
         boresight_B=jnp.tile(boresight_B, (count, 1)),
         axis_N=jnp.tile(jnp.array([1.0, 0.0, 0.0]), (count, 1)),
-        half_angle=jnp.full(count, ABSENT_HALF_ANGLE),
+        half_angle=jnp.full(count, ABSENT_HALF_ANGLE, jnp.float32),
     )
 
 

@@ -126,6 +126,14 @@ def test_it_decides_as_the_core_does_where_it_withstands_errors(agent, tmp_path)
 
 
 @pytest.mark.slow
+def test_it_decides_as_the_core_does_where_there_is_a_rate_limit(agent, tmp_path):
+    """Some of the situations are above it, and some requests would lead there."""
+    limited = of_the_task(agent, max_rate_deg=3.0)
+    write_files(tmp_path, export(limited, "c", CONFIG))
+    check_alike(limited, CLibrary(tmp_path))
+
+
+@pytest.mark.slow
 def test_it_decides_as_the_core_does_on_a_cubesat(agent, tmp_path):
     inertia = ((0.05, 0.0, 0.0), (0.0, 0.06, 0.0), (0.0, 0.0, 0.02))
     other = of_the_task(agent, inertia=inertia, torque_limit=0.004, boresight=(0.0, 0.0, 1.0))

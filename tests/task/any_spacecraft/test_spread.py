@@ -88,3 +88,15 @@ def test_draws_do_not_depend_on_each_other():
     key = jax.random.key(8)
     np.testing.assert_array_equal(with_rates.drawn(key).model.inertia_B, without.drawn(key).model.inertia_B)
     assert isinstance(spread.from_config(TASK), spread.Spread)
+
+
+def test_slender_bodies_are_as_slender_as_asked_for():
+    """Smallest over largest second moment of mass, from the principal moments."""
+    spread = TaskConfig(spread=SpreadConfig(spacecraft=True, slenderness=(0.05, 0.1)))
+    env = Reorientation.from_config(spread)
+    inertias = jax.jit(jax.vmap(lambda key: env.drawn(key).model.inertia_B))(jax.random.split(jax.random.key(3), 200))
+    moments = np.linalg.eigvalsh(np.asarray(inertias, np.float64))
+    second = 0.5 * moments.sum(axis=1, keepdims=True) - moments
+    shares = second.min(axis=1) / second.max(axis=1)
+    assert np.all((shares > 0.0499) & (shares < 0.1001))
+    assert np.ptp(shares) > 0.04
