@@ -1,9 +1,10 @@
 """What the shield guarantees, tried: controllers that do their worst, and common ones that it stops, in many settings.
 
-    python benchmarks/guarantee.py [--only WORD ...] [--scale SHARE] [--markdown FILE]
+    python benchmarks/guarantee.py [--only WORD ...] [--controllers NAME ...] [--scale SHARE] [--markdown FILE]
 
 Zones are checked at five instants per time step.  A row counts the cases of which the guarantee is given: starts from
-which it does not hold are counted apart.
+which it does not hold are counted apart.  All rows take hours; the file is written after each, and keeps the rows of
+other trials that it holds, each with the commit that it was made at.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ CUBESAT: dict[str, Any] = {
     "scenario": {"min_half_angle_deg": 30.0, "max_half_angle_deg": 30.0},
 }
 COLUMNS = ("trial", "controller", "cases", "starts not covered", "violated", "smallest margin [deg]")
-COLUMNS += ("not settled", "deadlocked", "shield acted")
+COLUMNS += ("not settled", "deadlocked", "shield acted", "commit")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,7 +97,7 @@ def fly(name: str, trial: Trial, scale: float) -> list[str]:
     shield = ShieldConfig(error_bounds=trial.errors or UncertaintyConfig()) if trial.shielded else None
     cases = max(int(scale * trial.cases), 1)
     config = MonteCarloConfig(cases=cases, substeps=5, shield=shield, uncertainty=trial.errors)
-    return [trial.title, name, *_cells(fly_cases(controller_named(name), trial.task, config))]
+    return [trial.title, name, *_cells(fly_cases(controller_named(name), trial.task, config)), stamp.commit()]
 
 
 def _cells(results: CaseResult) -> list[str]:
@@ -117,25 +118,45 @@ def main(argv: list[str]) -> int:
     """Print the table.  Returns the exit status."""
     parser = argparse.ArgumentParser(prog="benchmarks/guarantee.py", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--only", nargs="*", default=[], help="words that a trial's title must hold, any of them")
+    parser.add_argument("--controllers", nargs="*", default=[], help="names of controllers, by default all of a trial")
     parser.add_argument("--scale", type=float, default=1.0, help="share of the cases")
-    parser.add_argument("--markdown", type=Path, help="write the table with its origin, for docs/results/")
+    parser.add_argument("--markdown", type=Path, help="write the table, or add to it, for docs/results/")
     args = parser.parse_args(argv)
     return exit_status(lambda: _try_all(args, argv))
 
 
 def _try_all(args: argparse.Namespace, argv: list[str]) -> int:
     runtime.configure()
-    lines = [stamp.row(list(COLUMNS)), stamp.row(["---"] * len(COLUMNS))]
-    print("\n".join(lines))
+    rows = {} if args.markdown is None else _rows_of(args.markdown)
+    print("\n".join(_head()))
     for trial in trials():
         if args.only and not any(word in trial.title for word in args.only):
             continue
         for name in trial.controllers:
-            lines.append(stamp.row(fly(name, trial, args.scale)))
-            print(lines[-1], flush=True)
-    if args.markdown:
-        stamp.write_table(args.markdown, ["benchmarks/guarantee.py", *argv], "\n".join(lines))
+            if args.controllers and name not in args.controllers:
+                continue
+            row = fly(name, trial, args.scale)
+            print(stamp.row(row), flush=True)
+            rows[trial.title, name] = row
+            if args.markdown is not None:
+                table = "\n".join([*_head(), *(stamp.row(rows[key]) for key in _order() if key in rows)])
+                stamp.write_table(args.markdown, ["benchmarks/guarantee.py", *argv], table)
     return 0
+
+
+def _head() -> list[str]:
+    return [stamp.row(list(COLUMNS)), stamp.row(["---"] * len(COLUMNS))]
+
+
+def _order() -> list[tuple[str, str]]:
+    return [(trial.title, name) for trial in trials() for name in trial.controllers]
+
+
+def _rows_of(path: Path) -> dict[tuple[str, str], list[str]]:
+    """Rows that a table holds, by trial and controller."""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
+    return {(row[0], row[1]): row for row in rows if (row[0], row[1]) in _order() and len(row) == len(COLUMNS)}
 
 
 if __name__ == "__main__":
