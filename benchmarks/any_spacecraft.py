@@ -112,8 +112,8 @@ def main(argv: list[str]) -> int:
 def _fly_all(args: argparse.Namespace, argv: list[str]) -> int:
     runtime.configure()
     agent = load_agent(args.agent)
-    lines = [stamp.row(list(COLUMNS)), stamp.row(["---"] * len(COLUMNS))]
-    print("\n".join(lines))
+    order = [(trial.title, f"{urgency:g}") for trial in trials() for urgency in trial.urgencies]
+    table = stamp.GrowingTable(args.markdown, ["benchmarks/any_spacecraft.py", *argv], COLUMNS, order)
     for trial in trials():
         if args.only and not any(word in trial.title for word in args.only):
             continue
@@ -121,10 +121,7 @@ def _fly_all(args: argparse.Namespace, argv: list[str]) -> int:
         config = MonteCarloConfig(cases=args.cases, seed=args.seed, shield=shield, substeps=substeps)
         for urgency in trial.urgencies:
             results = fly_cases(agent.with_urgency(urgency).controller, trial.task, config)
-            lines.append(stamp.row(cells(trial, urgency, results)))
-            print(lines[-1], flush=True)
-    if args.markdown:
-        stamp.write_table(args.markdown, ["benchmarks/any_spacecraft.py", *argv], "\n".join(lines))
+            table.add(cells(trial, urgency, results))
     return 0
 
 

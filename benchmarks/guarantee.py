@@ -42,7 +42,7 @@ CUBESAT: dict[str, Any] = {
     "scenario": {"min_half_angle_deg": 30.0, "max_half_angle_deg": 30.0},
 }
 COLUMNS = ("trial", "controller", "cases", "starts not covered", "violated", "smallest margin [deg]")
-COLUMNS += ("not settled", "deadlocked", "shield acted", "commit")
+COLUMNS += ("not settled", "deadlocked", "shield acted")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +97,7 @@ def fly(name: str, trial: Trial, scale: float) -> list[str]:
     shield = ShieldConfig(error_bounds=trial.errors or UncertaintyConfig()) if trial.shielded else None
     cases = max(int(scale * trial.cases), 1)
     config = MonteCarloConfig(cases=cases, substeps=5, shield=shield, uncertainty=trial.errors)
-    return [trial.title, name, *_cells(fly_cases(controller_named(name), trial.task, config)), stamp.commit()]
+    return [trial.title, name, *_cells(fly_cases(controller_named(name), trial.task, config))]
 
 
 def _cells(results: CaseResult) -> list[str]:
@@ -127,36 +127,15 @@ def main(argv: list[str]) -> int:
 
 def _try_all(args: argparse.Namespace, argv: list[str]) -> int:
     runtime.configure()
-    rows = {} if args.markdown is None else _rows_of(args.markdown)
-    print("\n".join(_head()))
+    order = [(trial.title, name) for trial in trials() for name in trial.controllers]
+    table = stamp.GrowingTable(args.markdown, ["benchmarks/guarantee.py", *argv], COLUMNS, order)
     for trial in trials():
         if args.only and not any(word in trial.title for word in args.only):
             continue
         for name in trial.controllers:
-            if args.controllers and name not in args.controllers:
-                continue
-            row = fly(name, trial, args.scale)
-            print(stamp.row(row), flush=True)
-            rows[trial.title, name] = row
-            if args.markdown is not None:
-                table = "\n".join([*_head(), *(stamp.row(rows[key]) for key in _order() if key in rows)])
-                stamp.write_table(args.markdown, ["benchmarks/guarantee.py", *argv], table)
+            if not args.controllers or name in args.controllers:
+                table.add(fly(name, trial, args.scale))
     return 0
-
-
-def _head() -> list[str]:
-    return [stamp.row(list(COLUMNS)), stamp.row(["---"] * len(COLUMNS))]
-
-
-def _order() -> list[tuple[str, str]]:
-    return [(trial.title, name) for trial in trials() for name in trial.controllers]
-
-
-def _rows_of(path: Path) -> dict[tuple[str, str], list[str]]:
-    """Rows that a table holds, by trial and controller."""
-    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
-    return {(row[0], row[1]): row for row in rows if (row[0], row[1]) in _order() and len(row) == len(COLUMNS)}
 
 
 if __name__ == "__main__":

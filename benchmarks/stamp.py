@@ -22,6 +22,37 @@ def write_table(path: Path, argv: list[str], table: str) -> None:
     files.write_text(path, f"<!-- made by a command, see below; do not edit -->\n{head}\n\n{table}\n")
 
 
+class GrowingTable:
+    """A table whose rows take long: written after each, with the commit of each.
+
+    Rows of earlier runs that the file holds are kept until they are made again.
+    """
+
+    def __init__(
+        self, path: Path | None, argv: list[str], columns: tuple[str, ...], order: list[tuple[str, str]]
+    ) -> None:
+        """path: None prints only.  order: first two cells of all rows that there can be."""
+        self._path, self._argv, self._order = path, argv, order
+        self._head = [row([*columns, "commit"]), row(["---"] * (len(columns) + 1))]
+        self._rows = {} if path is None or not path.exists() else self._kept(path.read_text(encoding="utf-8"))
+        print("\n".join(self._head))
+
+    def add(self, cells: list[str]) -> None:
+        """Print a row, and write it."""
+        made = [*cells, commit()]
+        print(row(made), flush=True)
+        self._rows[made[0], made[1]] = made
+        if self._path is not None:
+            rows = [row(self._rows[key]) for key in self._order if key in self._rows]
+            write_table(self._path, self._argv, "\n".join([*self._head, *rows]))
+
+    def _kept(self, text: str) -> dict[tuple[str, str], list[str]]:
+        lines = [line for line in text.splitlines() if line.startswith("|")]
+        rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+        same_columns = bool(rows) and row(rows[0]) == self._head[0]
+        return {(cells[0], cells[1]): cells for cells in rows} if same_columns else {}
+
+
 def row(cells: list[str]) -> str:
     """A row of a Markdown table."""
     return f"| {' | '.join(cells)} |"
