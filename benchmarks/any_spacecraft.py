@@ -1,6 +1,6 @@
 """The agent for any spacecraft: random spacecraft and the paper's, at several urgencies, rate limits, with the shield.
 
-    python benchmarks/any_spacecraft.py [--agent NAME] [--cases N] [--seed N] [--markdown FILE]
+    python benchmarks/any_spacecraft.py [--agent NAME] [--cases N] [--seed N] [--only TITLE ...] [--markdown FILE]
 
 Times and efforts are in the units of the paper's spacecraft.  Zones are checked at every step, under the shield at five
 instants of it.
@@ -103,7 +103,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--agent", default="universal", help="name or folder of an agent for any spacecraft")
     parser.add_argument("--cases", type=int, default=10_000, help="cases of each row")
     parser.add_argument("--seed", type=int, default=1, help="seed of the draw")
-    parser.add_argument("--only", nargs="*", default=[], metavar="WORD", help="rows whose title has one of these words")
+    parser.add_argument("--only", nargs="*", default=[], metavar="TITLE", help="rows of these titles only")
     parser.add_argument("--markdown", type=Path, help="write the table with its origin, for docs/results/")
     args = parser.parse_args(argv)
     return exit_status(lambda: _fly_all(args, argv))
@@ -115,7 +115,7 @@ def _fly_all(args: argparse.Namespace, argv: list[str]) -> int:
     order = [(trial.title, f"{urgency:g}") for trial in trials() for urgency in trial.urgencies]
     table = stamp.GrowingTable(args.markdown, ["benchmarks/any_spacecraft.py", *argv], COLUMNS, order)
     for trial in trials():
-        if args.only and not any(word in trial.title for word in args.only):
+        if args.only and trial.title not in args.only:
             continue
         shield, substeps = (ShieldConfig(), 5) if trial.shielded else (None, 1)
         config = MonteCarloConfig(cases=args.cases, seed=args.seed, shield=shield, substeps=substeps)
