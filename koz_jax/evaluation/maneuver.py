@@ -62,7 +62,7 @@ def scenario(maneuver: ManeuverConfig) -> Scenario:
     return maneuvers.maneuver(
         maneuver.start.attitude,
         maneuver.aim.attitude,
-        [(one.direction, one.half_angle_deg, maneuver.boresight(one.instrument)) for one in maneuver.constraints],
+        [(*one.keep_out_cone, maneuver.boresight(one.instrument)) for one in maneuver.constraints],
         boresight=maneuver.task.spacecraft.boresight,
         rate_deg=maneuver.start.rate_deg,
     )

@@ -122,11 +122,12 @@ class ManeuverConfig(Table):
         """Margin to each constraint.  attitude: (..., 4).  Returns (..., constraints) [deg]."""
         if not self.constraints:
             return np.zeros((*attitude.shape[:-1], 0))
+        cones = [one.keep_out_cone for one in self.constraints]
+        looks = [attitudes.rotate(attitude, self.boresight(one.instrument)) for one in self.constraints]
         angles = [
-            attitudes.angle_between(attitudes.rotate(attitude, self.boresight(one.instrument)), np.array(one.direction))
-            for one in self.constraints
+            attitudes.angle_between(look, np.array(cone.direction)) for look, cone in zip(looks, cones, strict=True)
         ]
-        return np.rad2deg(np.stack(angles, axis=-1)) - [one.half_angle_deg for one in self.constraints]
+        return np.rad2deg(np.stack(angles, axis=-1)) - [cone.half_angle_deg for cone in cones]
 
     @property
     def aim(self) -> Aim:

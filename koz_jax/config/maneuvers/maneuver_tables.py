@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ValidationError, model_validator
@@ -131,6 +131,13 @@ class InstrumentConfig(Table):
     """Where it looks, in body axes; normalised on reading."""
 
 
+class Cone(NamedTuple):
+    """Directions that an instrument is kept out of."""
+
+    direction: Vector  # axis, in inertial axes
+    half_angle_deg: float
+
+
 class ConstraintConfig(Table):
     """A cone of directions that an instrument must not look into."""
 
@@ -144,6 +151,11 @@ class ConstraintConfig(Table):
     """Half angle of the cone [deg]."""
     rotation_deg: Annotated[Vector, _only_zero("allowed is [0, 0, 0]: directions are fixed")] = (0.0, 0.0, 0.0)
     """Angular velocity of the direction [deg/s]: not supported yet unless zero."""
+
+    @property
+    def keep_out_cone(self) -> Cone:
+        """What the instrument is kept out of, whatever the kind."""
+        return Cone(self.direction, self.half_angle_deg)
 
 
 class StartConfig(Table):
