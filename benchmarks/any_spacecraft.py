@@ -106,14 +106,14 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--only", nargs="*", default=[], metavar="TITLE", help="rows of these titles only")
     parser.add_argument("--markdown", type=Path, help="write the table with its origin, for docs/results/")
     args = parser.parse_args(argv)
-    return exit_status(lambda: _fly_all(args, argv))
+    return exit_status(lambda: _fly_all(args))
 
 
-def _fly_all(args: argparse.Namespace, argv: list[str]) -> int:
+def _fly_all(args: argparse.Namespace) -> int:
     runtime.configure()
     agent = load_agent(args.agent)
     order = [(trial.title, f"{urgency:g}") for trial in trials() for urgency in trial.urgencies]
-    table = stamp.GrowingTable(args.markdown, ["benchmarks/any_spacecraft.py", *argv], COLUMNS, order)
+    table = stamp.GrowingTable(args.markdown, "benchmarks/any_spacecraft.py", COLUMNS, order)
     for trial in trials():
         if args.only and trial.title not in args.only:
             continue

@@ -122,13 +122,13 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--scale", type=float, default=1.0, help="share of the cases")
     parser.add_argument("--markdown", type=Path, help="write the table, or add to it, for docs/results/")
     args = parser.parse_args(argv)
-    return exit_status(lambda: _try_all(args, argv))
+    return exit_status(lambda: _try_all(args))
 
 
-def _try_all(args: argparse.Namespace, argv: list[str]) -> int:
+def _try_all(args: argparse.Namespace) -> int:
     runtime.configure()
     order = [(trial.title, name) for trial in trials() for name in trial.controllers]
-    table = stamp.GrowingTable(args.markdown, ["benchmarks/guarantee.py", *argv], COLUMNS, order)
+    table = stamp.GrowingTable(args.markdown, "benchmarks/guarantee.py", COLUMNS, order)
     for trial in trials():
         if args.only and not any(word in trial.title for word in args.only):
             continue

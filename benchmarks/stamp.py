@@ -28,11 +28,9 @@ class GrowingTable:
     Rows of earlier runs that the file holds are kept until they are made again.
     """
 
-    def __init__(
-        self, path: Path | None, argv: list[str], columns: tuple[str, ...], order: list[tuple[str, str]]
-    ) -> None:
+    def __init__(self, path: Path | None, program: str, columns: tuple[str, ...], order: list[tuple[str, str]]) -> None:
         """path: None prints only.  order: first two cells of all rows that there can be."""
-        self._path, self._argv, self._order = path, argv, order
+        self._path, self._program, self._order = path, program, order
         self._head = [row([*columns, "commit"]), row(["---"] * (len(columns) + 1))]
         self._rows = {} if path is None or not path.exists() else self._kept(path.read_text(encoding="utf-8"))
         print("\n".join(self._head))
@@ -44,7 +42,7 @@ class GrowingTable:
         self._rows[made[0], made[1]] = made
         if self._path is not None:
             rows = [row(self._rows[key]) for key in self._order if key in self._rows]
-            write_table(self._path, self._argv, "\n".join([*self._head, *rows]))
+            write_table(self._path, [self._program], "\n".join([*self._head, *rows]))
 
     def _kept(self, text: str) -> dict[tuple[str, str], list[str]]:
         lines = [line for line in text.splitlines() if line.startswith("|")]
