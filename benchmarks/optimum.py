@@ -74,7 +74,7 @@ def improve(
     def cost_of(corrections: jax.Array, key: jax.Array) -> jax.Array:
         # The urgency is the policy's in the maneuvers of any spacecraft too.
         own = env.drawn(jax.random.fold_in(key, spread.PURPOSE)).replace(urgency=policy.urgency)
-        return refinement.fly_maneuver(policy, own, key, config, nudges=corrections).cost
+        return refinement.fly_maneuver(policy, own, key, config, nudges=corrections).mean
 
     def descend(
         carry: tuple[jax.Array, optax.OptState, jax.Array, jax.Array], _: None

@@ -18,7 +18,10 @@ _SIDE = 2048
 
 def write_table(path: Path, argv: list[str], table: str) -> None:
     """Write a Markdown table with its origin above it, for a page to include.  argv: what the command was given."""
-    head = f"Made by `{shlex.join(['python', *argv])}` at commit {commit()}; {machine()}."
+    _write(path, f"Made by `{shlex.join(['python', *argv])}` at commit {commit()}; {machine()}.", table)
+
+
+def _write(path: Path, head: str, table: str) -> None:
     files.write_text(path, f"<!-- made by a command, see below; do not edit -->\n{head}\n\n{table}\n")
 
 
@@ -42,7 +45,8 @@ class GrowingTable:
         self._rows[made[0], made[1]] = made
         if self._path is not None:
             rows = [row(self._rows[key]) for key in self._order if key in self._rows]
-            write_table(self._path, [self._program], "\n".join([*self._head, *rows]))
+            head = f"Rows of `python {self._program}`, each at its commit; the last one made on {machine()}."
+            _write(self._path, head, "\n".join([*self._head, *rows]))
 
     def _kept(self, text: str) -> dict[tuple[str, str], list[str]]:
         lines = [line for line in text.splitlines() if line.startswith("|")]

@@ -127,7 +127,7 @@ def _universal() -> TrainConfig:
                 spread=SpreadConfig(
                     spacecraft=True,
                     step_shares=(0.016, 0.06),
-                    # Most of them bind no maneuver: an agent without a limit is at the end of what it knows.
+                    # To far above what a maneuver needs: an agent without a limit is at the end of what it knows.
                     max_rate_deg=(2.0, 150.0),
                     urgency=(0.0, 1.0),
                     errors=UncertaintyConfig(

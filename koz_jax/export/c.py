@@ -74,6 +74,7 @@ def shield_files(metadata: Metadata, config: ShieldConfig, vectors: ShieldGolden
         "HEAD": _head(metadata),
         "EXPORT_ID": _export_id(metadata),
         "MARGIN_DEG": f"{np.rad2deg(made.margin):.4g}",
+        "MAX_RATE_DEG": "what torques allow" if model.max_rate is None else f"{np.rad2deg(model.max_rate):.4g} deg/s",
         "GUIDE_RATE_DEG": f"{np.rad2deg(made.guide.rate):.4g}",
         **{f"STATED_{name.upper()}": f"{error:g}" for name, error in config.error_bounds.model_dump().items()},
         **_limits(metadata.torque_limit),

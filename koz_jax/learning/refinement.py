@@ -108,10 +108,10 @@ def maneuver_environment(config: TrainConfig) -> Reorientation:
     return env.replace(scaled=config.network.scaled)
 
 
-class Flown(NamedTuple):
-    """A maneuver, for its gradient."""
+class ManeuverCost(NamedTuple):
+    """What a maneuver costs, and what its gradient in the weights is taken at."""
 
-    cost: jax.Array  # () mean per step
+    mean: jax.Array  # () per step
     observed: jax.Array  # (steps, entries) what the policy saw
 
 
@@ -122,7 +122,7 @@ def fly_maneuver(
     config: TrainConfig,
     reach: jax.Array | None = None,
     nudges: jax.Array | None = None,
-) -> Flown:
+) -> ManeuverCost:
     """Fly one random maneuver over the horizon; its cost is differentiable in the controller and in the nudges.
 
     reach: () largest norm of the gradient that passes back from step to step, None for any; nudges: (steps, 3) added
@@ -133,7 +133,7 @@ def fly_maneuver(
 
     # To fly a step again on the way back is cheaper than to store everything that its gradient needs.
     @functools.partial(jax.checkpoint, prevent_cse=False)
-    def advance(state: EnvState, nudge: jax.Array) -> tuple[EnvState, Flown]:
+    def advance(state: EnvState, nudge: jax.Array) -> tuple[EnvState, tuple[jax.Array, jax.Array]]:
         state = state if reach is None else state.replace(body=_limit_gradient(state.body, reach))
         measured = state if noise is None else env.measure(state, noise)
         observed = env.observe(measured)
@@ -142,11 +142,11 @@ def fly_maneuver(
         if env.model.max_rate is not None:
             rate = rotations.norm(stepped.state.body.omega_BN_B)
             cost = cost + config.refine.rate_weight * rate_cost(rate, env.model.max_rate)
-        return stepped.state, Flown(cost, observed)
+        return stepped.state, (cost, observed)
 
     nudges = jnp.zeros((config.refine_steps, ACTION_SIZE)) if nudges is None else nudges
-    _, steps = jax.lax.scan(advance, env.reset(key), nudges)
-    return Flown(jnp.mean(steps.cost) * (env.model.dt / config.task.step_seconds), steps.observed)
+    _, (costs, observed) = jax.lax.scan(advance, env.reset(key), nudges)
+    return ManeuverCost(jnp.mean(costs) * (env.model.dt / config.task.step_seconds), observed)
 
 
 @jax.custom_vjp
@@ -188,7 +188,7 @@ def _mean_gradient(
 
     def mean_cost(policy: Params) -> jax.Array:
         controller = PolicyController(policy, config.network)
-        return jnp.mean(jax.vmap(lambda key: fly_maneuver(controller, env, key, config, reach).cost)(keys))
+        return jnp.mean(jax.vmap(lambda key: fly_maneuver(controller, env, key, config, reach).mean)(keys))
 
     return jax.value_and_grad(mean_cost)(policy)
 
@@ -204,7 +204,7 @@ def _clipped_gradient(
     """
 
     def action_slopes(key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        def flown(nudges: jax.Array) -> Flown:
+        def flown(nudges: jax.Array) -> ManeuverCost:
             return fly_maneuver(PolicyController(policy, config.network), env, key, config, reach, nudges)
 
         nudges = jnp.zeros((config.refine_steps, ACTION_SIZE))

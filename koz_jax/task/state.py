@@ -43,9 +43,7 @@ class EnvState(struct.PyTreeNode):
     torque_B: jax.Array  # (3,) [N m] applied in the last step
     steps: jax.Array  # () int32, steps since the reset
     actuators: ActuatorState = None
-    on_the_way: jax.Array | None = (
-        None  # (MAX_DELAY, 3) commands of the last steps, the latest first; where any is late
-    )
+    on_the_way: jax.Array | None = None  # (MAX_DELAY, 3) last commands, the latest first; None where none is late
 
 
 class ActionFilter(Protocol):

@@ -35,7 +35,7 @@ KEYS = jax.random.split(jax.random.key(1), 16)
 
 def mean_cost(policy, keys):
     controller = PolicyController(policy, CONFIG.network)
-    return jnp.mean(jax.vmap(lambda key: refinement.fly_maneuver(controller, ENV, key, CONFIG).cost)(keys))
+    return jnp.mean(jax.vmap(lambda key: refinement.fly_maneuver(controller, ENV, key, CONFIG).mean)(keys))
 
 
 mean_cost_of, mean_gradient_of = jax.jit(mean_cost), jax.jit(jax.grad(mean_cost))

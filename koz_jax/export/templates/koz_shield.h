@@ -6,6 +6,7 @@
  *     @STATED_ATTITUDE_NOISE_DEG@ deg per axis in the measured attitude (standard deviation, cut at three times that),
  *     @STATED_RATE_NOISE_DEG@ deg/s per axis in the measured rate (likewise),
  *     @STATED_ATTITUDE_BIAS_DEG@ deg and @STATED_RATE_BIAS_DEG@ deg/s of constant error in what is measured.
+ * Keeps the body rate below @MAX_RATE_DEG@.
  * Leads around a zone at @GUIDE_RATE_DEG@ deg/s, and looks at @SAMPLES@ points of a brake path.
  *
 @HEAD@
