@@ -278,7 +278,7 @@ archive.save_tree(folder / sys.argv[2], flown.results, {"compiled": flown.compil
 
 @pytest.mark.slow
 def test_two_processes_of_two_devices_give_the_results_of_one(single, tmp_path):
-    variables = {**tiny.environment(), "XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    variables = {**tiny.environment(), **tiny.devices(2)}
     address = f"127.0.0.1:{tiny.free_port()}"
     workers = [
         subprocess.Popen(
@@ -336,9 +336,8 @@ archive.save_tree(__import__("pathlib").Path(sys.argv[2]), results, {})
 @pytest.mark.slow
 def test_four_devices_give_the_results_of_one(single, tmp_path, monkeypatch):
     assert jax.local_device_count() == 1
-    monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=4")
     monkeypatch.chdir(tmp_path)
-    done = tiny.run_python("-c", FLY, 4, tmp_path / "results", cwd=HERE)
+    done = tiny.run_python("-c", FLY, 4, tmp_path / "results", cwd=HERE, variables=tiny.devices(4))
     assert done.returncode == 0, done.stderr[-2000:]
     shapes = jax.eval_shape(lambda: single)
     assert_same(jax.tree.map(np.asarray, archive.load_tree(tmp_path / "results", shapes)), single)

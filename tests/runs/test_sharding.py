@@ -76,9 +76,7 @@ def four(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(train_step, "train_chunk", interrupted)
         with pytest.raises(KeyboardInterrupt):
             train(UNREFINED, folder / "run", progress=False)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=4")
-        done = tiny.run_python("-c", TRAIN, folder, STEPS, cwd=tiny.ROOT / "tests")
+    done = tiny.run_python("-c", TRAIN, folder, STEPS, cwd=tiny.ROOT / "tests", variables=tiny.devices(4))
     assert done.returncode == 0, done.stderr[-3000:]
     return folder
 

@@ -8,8 +8,9 @@ import socket
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import Any
 from unittest import mock
 
@@ -123,15 +124,28 @@ def status(name: str, *argv: object) -> int:
         return end.code
 
 
-def run_python(*argv: object, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
-    """Run Python in a subprocess."""
-    command = [sys.executable, *map(str, argv)]
-    return subprocess.run(command, env=environment(), cwd=cwd, capture_output=True, text=True, check=False)
+def run_python(
+    *argv: object, cwd: Path = ROOT, variables: Mapping[str, str] = MappingProxyType({})
+) -> subprocess.CompletedProcess[str]:
+    """Run Python in a subprocess, with further variables of its environment."""
+    return subprocess.run(
+        [sys.executable, *map(str, argv)],
+        env={**environment(), **variables},
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
 
 
 def environment() -> dict[str, str]:
     """Variables of a subprocess."""
     return {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+
+
+def devices(count: int) -> dict[str, str]:
+    """Variables of a subprocess that sees this many devices."""
+    return {"XLA_FLAGS": f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={count}"}
 
 
 def free_port() -> int:
@@ -141,14 +155,13 @@ def free_port() -> int:
         return server.getsockname()[1]
 
 
-def begin_two(*command: object, xla_flags: str = "") -> list[subprocess.Popen[str]]:
+def begin_two(*command: object) -> list[subprocess.Popen[str]]:
     """Begin a Python command in two processes of two devices each, which find each other by its last arguments."""
     several = ["--coordinator", f"127.0.0.1:{free_port()}", "--processes", 2, "--process"]
-    forced = {"XLA_FLAGS": f"--xla_force_host_platform_device_count=2 {xla_flags}", "PYTHONFAULTHANDLER": "1"}
     return [
         subprocess.Popen(
             [sys.executable, *map(str, [*command, *several, number])],
-            env=environment() | forced,
+            env={**environment(), **devices(2), "PYTHONFAULTHANDLER": "1"},
             cwd=ROOT,
             stderr=subprocess.PIPE,
             text=True,
