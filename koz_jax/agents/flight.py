@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from koz_jax.agents.agent import Agent, load_agent
+from koz_jax.agents.record import DEFAULT_AGENT, DEFAULT_FOR_OTHERS
 from koz_jax.config.maneuvers.maneuver import ManeuverConfig
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.shield import ShieldConfig
@@ -11,9 +12,6 @@ from koz_jax.control.registry import BUILT_IN, load_controller
 from koz_jax.errors import SettingsError
 from koz_jax.evaluation import maneuver as maneuvers
 from koz_jax.evaluation.maneuver import FlownManeuver
-
-# Who flies where nobody is named: the paper's spacecraft, and any other.
-DEFAULT_AGENT, DEFAULT_FOR_OTHERS = "phase2", "universal"
 
 
 def fly(

@@ -11,6 +11,9 @@ from koz_jax.config.training import NetworkConfig
 from koz_jax.errors import DamagedFileError, SettingsError, explain
 from koz_jax.storage import archive
 
+# Who flies where nobody is named: the paper's spacecraft, and any other.
+DEFAULT_AGENT, DEFAULT_FOR_OTHERS = "phase2", "universal"
+
 
 class Provenance(Settings):
     """Where an agent comes from."""

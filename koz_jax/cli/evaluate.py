@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import model_validator
 
+from koz_jax.agents.record import DEFAULT_FOR_OTHERS
 from koz_jax.cli import invocation
 from koz_jax.cli.exit_status import exit_status
 from koz_jax.cli.flags import parsing
@@ -52,7 +53,7 @@ class EvaluateFlags(ProcessFlags, FlightFlags, AgentFlags):
         """For another spacecraft or an urgency, the default is the agent that is for any."""
         default = cls.model_fields["agent"].default
         asks = given.get("spacecraft") is not None or given.get("urgency") is not None
-        return given | {"agent": "universal"} if asks and given.get("agent", default) == default else given
+        return given | {"agent": DEFAULT_FOR_OTHERS} if asks and given.get("agent", default) == default else given
 
     def task(self, agent: TaskController) -> TaskConfig:
         """What is flown: the agent's task, or the paper's draw for another spacecraft, with the changes of the flags.

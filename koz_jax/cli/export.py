@@ -12,10 +12,11 @@ from tyro.conf import Positional
 from koz_jax.cli import invocation
 from koz_jax.cli.exit_status import exit_status
 from koz_jax.cli.flags import parsing
-from koz_jax.cli.flags.flight import AGENT
+from koz_jax.cli.flags.flight import AGENT, URGENCY
 from koz_jax.config.base import MarginDeg, Settings
 from koz_jax.config.maneuvers.maneuver_file import load_spacecraft
 from koz_jax.config.shield import ShieldConfig
+from koz_jax.config.spread import Urgency
 from koz_jax.config.uncertainty import CERTAIN, UncertaintyConfig
 
 
@@ -30,6 +31,7 @@ class _FormatFlags(Settings):
     spacecraft: Path | None = None
     """Of an agent for any spacecraft, the one that it is exported for, and the shield with it: a TOML file with a table
     [spacecraft] and step_seconds, such as a maneuver file; by default that of the agent's task."""
+    urgency: Urgency | None = Field(default=None, description=URGENCY)
     shield: bool = False
     """Also write the shield, which keeps the boresight out of every zone; for --to c."""
     shield_margin_deg: MarginDeg = parsing.same_as(ShieldConfig, "margin_deg")
@@ -78,7 +80,10 @@ def _export(asked: ExportFlags) -> int:
     from koz_jax.storage.files import make_folder
 
     task = None if asked.spacecraft is None else load_spacecraft(asked.spacecraft).task
+    agent = load_agent(asked.agent)
+    if asked.urgency is not None:
+        agent = agent.with_urgency(asked.urgency)
     make_folder("out", asked.out)
-    for path in write_files(asked.out, export(load_agent(asked.agent), asked.to, asked.shield_config, task)):
+    for path in write_files(asked.out, export(agent, asked.to, asked.shield_config, task)):
         print(path)
     return 0

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal, Self
 
 from pydantic import Field, model_validator
 
-from koz_jax.agents.record import find_agent, read_agent_record
+from koz_jax.agents.record import DEFAULT_AGENT, DEFAULT_FOR_OTHERS, find_agent, read_agent_record
 from koz_jax.cli import invocation
 from koz_jax.cli.exit_status import exit_status
 from koz_jax.cli.flags import parsing
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from koz_jax.config.task import TaskConfig
     from koz_jax.control.base import TaskController
 
-_DEFAULT_AGENT = "phase2"
-
 
 class FlyFlags(TurnFlags, OneCaseFlags):
     """Fly one maneuver with a trained agent or another controller; draw the boresight's trace on the sphere and the
@@ -35,7 +33,7 @@ class FlyFlags(TurnFlags, OneCaseFlags):
 
     agent: str | None = Field(
         default=None,
-        description=f"Who flies: {AGENT}. By default {_DEFAULT_AGENT}; for another spacecraft, the one for any.",
+        description=f"Who flies: {AGENT}. By default {DEFAULT_AGENT}; for another spacecraft, the one for any.",
     )
     urgency: Urgency | None = Field(default=None, description=URGENCY)
     controller: str | None = Field(
@@ -76,7 +74,7 @@ class FlyFlags(TurnFlags, OneCaseFlags):
         """What the agent was made for."""
         from koz_jax.agents.sb3 import is_sb3
 
-        name = self.agent or _DEFAULT_AGENT
+        name = self.agent or DEFAULT_AGENT
         if is_sb3(name):
             from koz_jax.agents.agent import load_agent
 
@@ -98,17 +96,17 @@ class FlyFlags(TurnFlags, OneCaseFlags):
 
         """
         from koz_jax.agents.agent import load_agent
-        from koz_jax.agents.flight import DEFAULT_FOR_OTHERS, in_a_hurry, load_for
+        from koz_jax.agents.flight import in_a_hurry, load_for
         from koz_jax.control.registry import load_controller
 
         own = self.own_maneuver
         if self.controller is not None:
-            task = load_agent(self.agent or _DEFAULT_AGENT).task if own is None else own.task
+            task = load_agent(self.agent or DEFAULT_AGENT).task if own is None else own.task
             flying = load_controller(self.controller, task)
         elif own is not None:
             return load_for(own, self.agent and load_agent(self.agent), self.urgency)
         else:
-            default = _DEFAULT_AGENT if self.urgency is None else DEFAULT_FOR_OTHERS
+            default = DEFAULT_AGENT if self.urgency is None else DEFAULT_FOR_OTHERS
             flying = load_agent(self.agent or default)
         return flying if self.urgency is None else in_a_hurry(flying, self.urgency)
 

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pydantic import Field, PositiveFloat
 
+from koz_jax.agents.record import DEFAULT_FOR_OTHERS
 from koz_jax.cli import invocation
 from koz_jax.cli.exit_status import exit_status
 from koz_jax.cli.flags import parsing
 from koz_jax.cli.flags.flight import AGENTS, CONTROLLERS
 from koz_jax.cli.flags.one_case import OneCaseFlags
 from koz_jax.config.base import Settings
+from koz_jax.config.spread import Urgency
 
 if TYPE_CHECKING:
     from koz_jax.control.base import TaskController
@@ -29,6 +32,11 @@ class _AgentsFlags(Settings):
     agent: tuple[str, ...] = Field(
         default=(),
         description=f"Who flies: {AGENTS}. By default those of {' and '.join(DEFAULT_AGENTS)} whose spacecraft it is.",
+    )
+    urgency: tuple[Urgency, ...] = Field(
+        default=(),
+        description="How much agents for any spacecraft hurry, from 0 (thrifty) to 1 (as fast as the torque allows):"
+        f" each is shown at each of these; by default {DEFAULT_FOR_OTHERS}. Without it they fly at 0.5.",
     )
     controller: str | None = Field(
         default=None, description=f"Show this one too, on the first agent's task or the maneuver's: {CONTROLLERS}."
@@ -46,7 +54,12 @@ class ViewFlags(OneCaseFlags, _AgentsFlags):
     @property
     def names(self) -> tuple[str, ...]:
         """Agents that fly."""
-        return self.agent or DEFAULT_AGENTS
+        return self.agent or ((DEFAULT_FOR_OTHERS,) if self.urgency else DEFAULT_AGENTS)
+
+    @property
+    def count(self) -> int:
+        """How many fly at most."""
+        return len(self.names) * max(len(self.urgency), 1) + (self.controller is not None)
 
     def load(self) -> list[TaskController]:
         """Load all who fly.
@@ -56,7 +69,7 @@ class ViewFlags(OneCaseFlags, _AgentsFlags):
 
         """
         from koz_jax.agents.agent import load_agent
-        from koz_jax.agents.flight import load_for
+        from koz_jax.agents.flight import in_a_hurry, load_for
         from koz_jax.control.registry import load_controller
         from koz_jax.evaluation.maneuver import unfamiliar
 
@@ -65,6 +78,12 @@ class ViewFlags(OneCaseFlags, _AgentsFlags):
         if own is not None and not self.agent:
             flying = [agent for agent in flying if not unfamiliar(agent, own)]
         task = own.task if own is not None else flying[0].task
+        if self.urgency:
+            flying = [
+                dataclasses.replace(in_a_hurry(agent, urgency), name=f"{agent.name}, urgency {urgency:g}")
+                for agent in flying
+                for urgency in self.urgency
+            ]
         if self.controller is not None:
             flying.append(load_controller(self.controller, task))
         # Where nobody is left, the default agent is refused with a reason.
@@ -83,7 +102,7 @@ def _view(asked: ViewFlags) -> int:
     from koz_jax.viewer import maneuver as viewed
     from koz_jax.viewer import page
 
-    page.check_count("agent", len(asked.names) + (asked.controller is not None))
+    page.check_count("agent", asked.count)
     files.check_writable("out", asked.out)
     page.plotly_library()
     runtime.configure()

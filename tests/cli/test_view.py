@@ -54,6 +54,9 @@ def test_command_draws_the_case_of_the_monte_carlo(saved, tmp_path, capsys):
         (["--robust"], "robust: is of the shield, and needs --shield"),
         (["--zones", "2"], "zones: is of the draw, and needs --case"),
         (["--agent", "SAVED", "--controller", "nobody"], "controller: must be one of pd"),
+        (["--agent", "SAVED", "--urgency", "0.5"], "untrained was trained for one trade"),
+        (["--urgency", "1.5"], "urgency.0: Input should be less than or equal to 1"),
+        (["--urgency", *["0.5"] * 9], "agent: one page shows 1 to 8, got 9"),
         (["--agent", *["x"] * 9], "agent: one page shows 1 to 8, got 9"),
         (["--agent", *["x"] * 8, "--controller", "pd"], "agent: one page shows 1 to 8, got 9"),
         (["--case", "1", "--cases", "0"], "cases: Input should be greater than 0"),
@@ -104,6 +107,10 @@ def test_a_maneuver_of_ones_own_is_shown_as_it_is_flown(saved, tmp_path):
     assert tiny.status("view", *argv) == 0
     (shown,) = content_of((tmp_path / "x.html").read_text())["maneuvers"]
     assert shown["label"] == "universal"
+    assert tiny.status("view", *argv, "--urgency", 0, 1) == 0
+    thrifty, fast = content_of((tmp_path / "x.html").read_text())["maneuvers"]
+    assert (thrifty["label"], fast["label"]) == ("universal, urgency 0", "universal, urgency 1")
+    assert thrifty["attitude"][-1] != fast["attitude"][-1]
     assert tiny.status("view", *argv, "--controller", "pd") == 0
     (shown,) = content_of((tmp_path / "x.html").read_text())["maneuvers"]
     assert shown["label"] == "pd"

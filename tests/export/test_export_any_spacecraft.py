@@ -235,11 +235,27 @@ def test_the_command_line(tmp_path, capsys):
     assert {name: (tmp_path / "c" / name).read_bytes() for name in expected} == expected
     header = (tmp_path / "c" / "koz_policy.h").read_text()
     assert "#define KOZ_STEP_SECONDS 0.2f" in header and "#define KOZ_TORQUE_LIMIT 0.004f" in header
+    assert tiny.status("export", tmp_path / "agent", *out, "--spacecraft", file, "--urgency", 0.25) == 0
+    assert "#define KOZ_URGENCY 0.25f" in (tmp_path / "c" / "koz_policy.h").read_text()
     capsys.readouterr()
+    assert tiny.status("export", "phase2", "--to", "c", "--out", tmp_path / "other", "--urgency", 0.25) == 2
+    assert "error: urgency: phase2 was trained for one trade" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
     assert tiny.status("export", "phase2", *out, "--spacecraft", file) == 2
     assert "error: spacecraft: phase2 was trained for one spacecraft" in capsys.readouterr().err
     assert tiny.status("export", tmp_path / "agent", *out, "--spacecraft", tmp_path / "none.toml") == 2
     assert "none.toml cannot be read" in capsys.readouterr().err
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["asteria_6u", "minxss_3u", "innocube_3u"])
+def test_the_shipped_agent_and_its_shield_pass_their_self_tests_for_the_cubesats(name, tmp_path):
+    file = tiny.ROOT / "examples" / f"{name}.toml"
+    argv = ["universal", "--to", "c", "--out", tmp_path, "--spacecraft", file, "--shield"]
+    assert tiny.status("export", *argv) == 0
+    done = tiny.make_test(tmp_path)
+    assert done.returncode == 0 and done.stdout.count("passed") == 2, done.stdout + done.stderr
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from koz_jax.agents.record import shipped_agents
+from koz_jax.agents.record import DEFAULT_AGENT, shipped_agents
 from koz_jax.cli.flags import parsing
 from koz_jax.cli.flags.parsing import ChangesOf, agents_own, same_as
 from koz_jax.config.base import MarginDeg, NonNegativeFloat, Settings, ZoneCount
@@ -41,7 +41,7 @@ CONTROLLERS = (
 class AgentFlags(Settings):
     """Who flies."""
 
-    agent: str = Field(default="phase2", description=f"Who flies: {AGENT}.")
+    agent: str = Field(default=DEFAULT_AGENT, description=f"Who flies: {AGENT}.")
     controller: str | None = Field(
         default=None, description=f"Fly this on the agent's task in place of the agent: {CONTROLLERS}."
     )
