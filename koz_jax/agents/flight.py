@@ -71,7 +71,7 @@ def _named(maneuver: ManeuverConfig, name: Path | str) -> TaskController:
     return load_agent(name)
 
 
-def in_a_hurry(flying: TaskController, urgency: float) -> TaskController:
+def in_a_hurry(flying: TaskController, urgency: float) -> Agent:
     """The same with an urgency, from 0 (thrifty) to 1 (as fast as the torque allows).
 
     Raises:
