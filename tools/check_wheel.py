@@ -45,7 +45,7 @@ def install(environment: Path, wheel: Path, extra: str = "viz") -> None:
     """Make a fresh environment with the wheel and the tested versions."""
     venv.create(environment, with_pip=True)
     requirement = f"koz_jax[{extra}] @ {wheel.as_uri()}"
-    pip = [str(environment / "bin" / "python"), "-m", "pip", "install", "-qq"]
+    pip = [str(environment / "bin" / "python"), "-m", "pip", "install", "-qq", "--no-compile"]
     subprocess.run([*pip, "--constraint", str(ROOT / "constraints.txt"), requirement], check=True)
 
 

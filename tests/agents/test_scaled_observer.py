@@ -42,9 +42,9 @@ def test_it_flies_any_spacecraft_as_the_core_does():
         # Towards an axis that the instrument nearly points at, the direction is a small difference divided by itself.
         closeness = max(1.0, 1.0 / (2.0 * np.sin(0.5 * seen[slices(1, scaled=True)["zone_angle"]][0])))
         np.testing.assert_allclose(observed, seen, rtol=0, atol=2e-6 * closeness)
-        np.testing.assert_allclose(POLICY.predict(seen), action, rtol=0, atol=2e-6)
+        np.testing.assert_allclose(POLICY.predict(seen), action, rtol=0, atol=5e-6)
         limits = np.array(told.spacecraft.torque_limits)
-        np.testing.assert_allclose(observer.torque(action) / limits, torque_B / limits, rtol=0, atol=2e-6)
+        np.testing.assert_allclose(observer.torque(action) / limits, torque_B / limits, rtol=0, atol=5e-6)
         actions.append(action)
         clipped += int(np.any(np.abs(torque_B) > 0.999 * limits))
     assert np.std(actions, axis=0).min() > 0.3 and 25 < clipped < 225

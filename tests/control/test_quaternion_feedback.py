@@ -72,5 +72,5 @@ def test_pd_without_saturation_has_a_lyapunov_function():
     rates = jnp.asarray(0.003 * rng.standard_normal((200, 3)), jnp.float32)
     strength, before, after = jax.jit(jax.vmap(one))(errors, rates)
     free = np.asarray(strength) < 1.0
-    assert free.sum() > 100
+    assert free.sum() > 50
     assert np.all(np.asarray(after)[free] < np.asarray(before)[free])
