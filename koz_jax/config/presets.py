@@ -139,12 +139,13 @@ def _universal() -> TrainConfig:
             "eval_cases": 400,
             "refine_eval_every": 500,
             "network": NetworkConfig(
-                hidden_sizes=(160, 160), encoding=EncodingConfig(rate_scales=(0.016, 0.16)), scaled=True
+                hidden_sizes=(208, 208), encoding=EncodingConfig(rate_scales=(0.016, 0.16)), scaled=True
             ),
             "refine": fast.refine.model_copy(
                 update={
                     "horizon_seconds": 45.0,
-                    "learning_rate": 2e-3,
+                    "optimizer": "muon",
+                    "learning_rate": 3e-3,
                     "effort_weight": 3.46,
                     "urgency_factor": 14.0,
                     "rate_weight": 20.0,
@@ -153,7 +154,7 @@ def _universal() -> TrainConfig:
                     "state_gradient": (1.0, 300.0),
                     "max_gradient_norm": 1.0,
                     "scenarios": 96,
-                    "iterations": 8000,
+                    "iterations": 7000,
                 }
             ),
         }

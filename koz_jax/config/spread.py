@@ -25,7 +25,7 @@ class SpreadConfig(Settings):
     max_rate_deg: tuple[PositiveFloat, PositiveFloat] | None = None
     """Limits of the body rate [deg/s], distributed evenly over their logarithm; None leaves the spacecraft's own."""
     urgency: tuple[Urgency, Urgency] | None = None
-    """Urgencies that an agent is trained with; None leaves 0.5."""
+    """Urgencies that an agent is trained with, a seventh of the maneuvers at either end; None leaves 0.5."""
 
     errors: UncertaintyConfig = CERTAIN
     """Errors that every maneuver is flown with."""

@@ -7,7 +7,7 @@ Angles are in degrees here, where people write them, and in radians everywhere e
 from __future__ import annotations
 
 import hashlib
-from typing import Self
+from typing import Literal, Self
 
 from pydantic import model_validator
 
@@ -86,6 +86,8 @@ class RefineConfig(Settings):
     """Maneuvers per gradient step."""
     horizon_seconds: PositiveFloat = 30.0
     """Length of each maneuver [s]."""
+    optimizer: Literal["adam", "muon"] = "adam"
+    """adam: every weight by itself; muon: the matrices by orthogonalised steps, of which a wide network needs fewer."""
     learning_rate: PositiveFloat = 1e-3
     """Learning rate at the start; it falls to zero along a cosine."""
     max_gradient_norm: PositiveFloat = 0.03

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import optax.contrib
 from flax import struct
 
 from koz_jax.config.training import RefineConfig, TrainConfig
@@ -47,7 +48,8 @@ class RefineState(struct.PyTreeNode):
 
 def _optimizer(config: RefineConfig) -> optax.GradientTransformation:
     schedule = optax.cosine_decay_schedule(config.learning_rate, max(config.iterations, 1))
-    return optax.chain(optax.clip_by_global_norm(config.max_gradient_norm), optax.adam(schedule))
+    take = optax.contrib.muon if config.optimizer == "muon" else optax.adam
+    return optax.chain(optax.clip_by_global_norm(config.max_gradient_norm), take(schedule))
 
 
 def init(config: TrainConfig, policy: Params) -> RefineState:
@@ -233,7 +235,7 @@ def refine_chunk(config: TrainConfig, state: RefineState, iterations: jax.Array)
 
         find = _clipped_gradient if config.refine.max_maneuver_gradient else _mean_gradient
         cost, gradient = find(config, env, state.policy, keys, reach)
-        change, optimizer = _optimizer(config.refine).update(gradient, state.optimizer)
+        change, optimizer = _optimizer(config.refine).update(gradient, state.optimizer, state.policy)
         policy = optax.apply_updates(state.policy, change)
         return RefineState(policy, optimizer, key, state.iterations + 1), total + cost
 

@@ -95,10 +95,12 @@ def test_the_gradient_is_finite_at_rest_on_the_target():
 
 
 @pytest.mark.slow
-def test_refinement_lowers_the_cost_on_maneuvers_it_has_not_seen(policy):
+@pytest.mark.parametrize("optimizer", ["adam", "muon"])
+def test_refinement_lowers_the_cost_on_maneuvers_it_has_not_seen(optimizer, policy):
+    config = CONFIG.model_copy(update={"refine": CONFIG.refine.model_copy(update={"optimizer": optimizer})})
     batches = jax.random.split(jax.random.key(99), (4, len(KEYS)))
-    state = refinement.init(CONFIG, jax.tree.map(jnp.copy, policy))
-    refined, _ = refinement.refine_chunk(CONFIG, state, jnp.int32(40))
+    state = refinement.init(config, jax.tree.map(jnp.copy, policy))
+    refined, _ = refinement.refine_chunk(config, state, jnp.int32(40))
     after, before = (np.mean([mean_cost_of(one, keys) for keys in batches]) for one in (refined.policy, policy))
     assert after < 0.98 * before
 

@@ -20,6 +20,9 @@ PURPOSE = 0x535052
 # Separates the key of the delay from those of the other draws.
 _DELAY = 0x44454C
 
+# Share of the maneuvers at either end of the urgencies, beyond which an agent learns nothing.
+_AT_AN_END = 1.0 / 7.0
+
 # Torque limits of the axes differ by at most this factor.
 _UNEQUAL = 2.0
 
@@ -60,8 +63,14 @@ def draw(spread: Spread, model: Model, boresight_B: jax.Array, key: jax.Array) -
     if spread.rate_limits:
         low, high = jnp.log(spread.max_rates)
         model = model.replace(max_rate=jnp.exp(jax.random.uniform(key_rate, (), minval=low, maxval=high)))
+    return Drawn(model, boresight_B, _urgency(spread, key_urgency), delay)
+
+
+def _urgency(spread: Spread, key: jax.Array) -> jax.Array:
+    """Evenly distributed, but for the shares at both ends.  Returns ()."""
     low, high = spread.urgencies
-    return Drawn(model, boresight_B, jax.random.uniform(key_urgency, (), minval=low, maxval=high), delay)
+    share = (jax.random.uniform(key) - _AT_AN_END) / (1.0 - 2.0 * _AT_AN_END)
+    return low + (high - low) * jnp.clip(share, 0.0, 1.0)
 
 
 def _sample_body(spread: Spread, model: Model, key: jax.Array) -> Model:

@@ -51,6 +51,14 @@ def test_torque_limits_steps_rates_and_urgencies_stay_in_their_ranges(drawn):
     assert abs(np.median(np.log(rates)) - np.log(40.0) / 2) < 0.1  # even over the logarithm
 
 
+def test_a_seventh_of_the_maneuvers_is_at_either_end_of_the_urgencies(drawn):
+    urgency = np.asarray(drawn.urgency)
+    for end in (0.2, 0.8):
+        assert abs(np.mean(np.isclose(urgency, end)) - 1.0 / 7.0) < 4.0 * np.sqrt(6.0 / 49.0 / COUNT)
+    between = urgency[(urgency > 0.2001) & (urgency < 0.7999)]
+    np.testing.assert_allclose(np.quantile(between, (0.25, 0.5, 0.75)), (0.35, 0.5, 0.65), atol=0.03)
+
+
 def test_instruments_and_principal_axes_point_anywhere(drawn):
     boresights = np.asarray(drawn.ranges.boresight_B)
     np.testing.assert_allclose(np.linalg.norm(boresights, axis=1), 1.0, rtol=1e-5)
