@@ -4,6 +4,9 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt
 
+# One worker for each core; in the order that tests/conftest.py gives the files.
+WORKERS := -n auto --dist loadfile --no-loadscope-reorder
+
 .PHONY: train evaluate test test-fast test-pythons lint docs benchmark figures notebooks
 
 train: $(VENV)/.core
@@ -13,10 +16,10 @@ evaluate: $(VENV)/.core
 	$(BIN)/koz evaluate $(ARGS)
 
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest -n auto --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest $(WORKERS) $(ARGS)
 
 test-fast: $(VENV)/.dev
-	$(BIN)/python -m pytest -n auto --dist loadfile -m "not slow and not gpu" $(ARGS)
+	$(BIN)/python -m pytest $(WORKERS) -m "not slow and not gpu" $(ARGS)
 
 # A short selection on every Python that is found, and once with the lowest versions of pyproject.toml.
 test-pythons:
@@ -42,12 +45,16 @@ figures: $(VENV)/.dev
 notebooks: $(VENV)/.dev
 	$(BIN)/python notebooks/build.py $(ARGS)
 
-$(VENV)/.core: pyproject.toml constraints.txt
+define install
 	$(PYTHON) -c 'import sys; sys.exit("koz_jax needs Python 3.11 or later: set PYTHON" if sys.version_info < (3, 11) else 0)'
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) --editable .
-	touch $@
+	$(PIP) --editable "$(1)"
+	touch $(VENV)/.core
+endef
 
-$(VENV)/.dev: $(VENV)/.core
-	$(PIP) --editable ".[dev]"
+$(VENV)/.core: pyproject.toml constraints.txt
+	$(call install,.)
+
+$(VENV)/.dev: pyproject.toml constraints.txt
+	$(call install,.[dev])
 	touch $@

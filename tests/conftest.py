@@ -2,6 +2,7 @@
 
 import gc
 import os
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -24,6 +25,12 @@ runtime.keep_programs()
 # The first example of a property compiles; a deadline would measure that.
 settings.register_profile("koz_jax", deadline=None, derandomize=True, max_examples=50)
 settings.load_profile("koz_jax")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files that have most slow tests, so that all workers are busy to the end."""
+    slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
+    items.sort(key=lambda item: -slow[item.path])
 
 
 # Linux lets a process map 65,530 pieces of memory.  Every compiled program takes some, and past the limit XLA crashes.

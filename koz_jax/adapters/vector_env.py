@@ -227,9 +227,10 @@ def _filled_up(asked: Scenario, zones: int) -> Scenario:
     present = np.flatnonzero(np.asarray(stack.half_angle) > 0.0)
     if len(present) > zones:
         raise SettingsError(f"zones: must be at most {zones} (max_zones of the task's scenarios), got {len(present)}")
-    filling = pointing_constraints.absent(zones - len(present), stack.boresight_B[0])
-    stack = jax.tree.map(lambda leaf, more: np.concatenate([np.asarray(leaf)[present], more]), stack, filling)
-    return asked.replace(constraints=stack)
+    if stack.axis_rate_N is not None:
+        raise SettingsError("zones: must have fixed axes, got some that turn")
+    stack = jax.tree.map(lambda leaf: np.asarray(leaf)[present] if len(present) else np.asarray(leaf)[:1], stack)
+    return asked.replace(constraints=pointing_constraints.filled_up(stack, zones))
 
 
 def _keys(seeds: Sequence[int], num_envs: int) -> jax.Array:

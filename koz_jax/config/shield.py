@@ -6,7 +6,7 @@ from typing import Self
 
 from pydantic import AliasChoices, Field, model_validator
 
-from koz_jax.config.base import MarginDeg, PositiveFloat, PositiveInt, Settings, Vector
+from koz_jax.config.base import MarginDeg, NonNegativeFloat, PositiveFloat, PositiveInt, Settings, Vector
 from koz_jax.config.uncertainty import CERTAIN, UncertaintyConfig
 from koz_jax.errors import SettingsError
 
@@ -20,6 +20,8 @@ class ShieldConfig(Settings):
         default=CERTAIN, validation_alias=AliasChoices("error_bounds", "withstands")
     )
     """Errors for which the guarantee holds."""
+    cone_rate_deg: NonNegativeFloat = 0.0
+    """Largest rate of a cone's axis that it is kept against [deg/s]; a maneuver file says its own."""
     guide_rate_deg: PositiveFloat | None = None
     """Rate with which the boresight is led around a zone [deg/s]; by default what suits the spacecraft."""
     samples: PositiveInt = 12
@@ -47,4 +49,18 @@ class ShieldConfig(Settings):
             raise SettingsError(
                 f"disturbance_torque: must be below the torque limit of {weakest} N m for the shield to withstand"
                 f" it, got {disturbance}"
+            )
+
+    def check_cones(self, rate_deg: float) -> None:
+        """Refuse a maneuver whose cones turn faster than is withstood.  rate_deg: [deg/s] of the fastest axis.
+
+        Raises:
+            SettingsError: they do.
+
+        """
+        # With room for what float32 rounds.
+        if rate_deg > self.cone_rate_deg * (1.0 + 1e-5):
+            raise SettingsError(
+                f"shield.cone_rate_deg: must be at least {rate_deg:.6g}, the rate of the maneuver's fastest cone, got"
+                f" {self.cone_rate_deg:g}"
             )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -20,6 +20,11 @@ class SpreadConfig(Settings):
     of 2; the trace of the inertia and the strength of the actuators are the task's."""
     slenderness: tuple[Fraction, Fraction] | None = None
     """Smallest over largest second moment of mass of these spacecraft; None draws all three from 0.05 to 1."""
+    wheels: Literal["three", "pyramid"] | None = None
+    """Turn these spacecraft by reaction wheels, three along the body axes or four in a pyramid, all of one size, with
+    a bias of up to 30 % of their momentum at the start; None by a torque box."""
+    wheel_momentum: tuple[PositiveFloat, PositiveFloat] = (1.0, 4.0)
+    """Largest momentum of these wheels, in units of u T."""
     step_shares: tuple[PositiveFloat, PositiveFloat] = (0.009, 0.05)
     """Time steps of these spacecraft, in units of T = sqrt(J / u)."""
     max_rate_deg: tuple[PositiveFloat, PositiveFloat] | None = None
@@ -34,7 +39,9 @@ class SpreadConfig(Settings):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        for name in ("slenderness", "step_shares", "max_rate_deg", "urgency", "delay_steps"):
+        if self.wheels is not None and not self.spacecraft:
+            raise ValueError(f"wheels: are drawn with spacecraft = true, got {self.wheels!r} without it")
+        for name in ("slenderness", "step_shares", "wheel_momentum", "max_rate_deg", "urgency", "delay_steps"):
             limits = getattr(self, name)
             if limits is not None and limits[0] > limits[1]:
                 raise ValueError(f"{name} must be in order; got {limits}")

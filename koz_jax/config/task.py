@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Discriminator, Tag, model_validator
 
+from koz_jax.config import wheels
 from koz_jax.config.base import (
     HalfAngleDeg,
     NonNegativeFloat,
@@ -18,6 +19,7 @@ from koz_jax.config.base import (
     check_steps,
 )
 from koz_jax.config.spread import SpreadConfig
+from koz_jax.config.wheels import WheelConfig
 from koz_jax.errors import SettingsError
 
 
@@ -39,13 +41,17 @@ class SpacecraftConfig(Settings):
     boresight: Vector = (1.0, 0.0, 0.0)
     """Unit vector of the telescope in body axes."""
     torque_limit: TorqueLimit = 2.0
-    """Largest torque about each body axis [N m]: one number for all, or one for each."""
+    """Largest torque about each body axis [N m]: one number for all, or one for each; of no effect beside wheels."""
+    wheels: tuple[WheelConfig, ...] = ()
+    """Reaction wheels that make the torque, at least three; none for actuators without momentum."""
     max_rate_deg: PositiveFloat | None = None
     """Largest norm of the body rate [deg/s], for agents that keep one; None sets no limit."""
 
     @property
     def torque_limits(self) -> Vector:
-        """Largest torque about each body axis [N m]."""
+        """Largest torque about each body axis [N m]; of wheels when the body is at rest, all axes at once."""
+        if self.wheels:
+            return wheels.torque_box(self.wheels)
         limit = self.torque_limit
         return limit if isinstance(limit, tuple) else (limit, limit, limit)
 
@@ -61,6 +67,7 @@ class SpacecraftConfig(Settings):
 
     @model_validator(mode="after")
     def _physical(self) -> Self:
+        wheels.check_span(self.wheels)
         inertia = np.array(self.inertia)
         if not np.allclose(inertia, inertia.T, rtol=1e-6, atol=0.0):
             raise ValueError(f"inertia must be symmetric; got {self.inertia}")

@@ -76,17 +76,20 @@ def sample(path: AttitudePath, points: int) -> Samples:
     return Samples(*jax.vmap(path.attitude_and_slope)(jnp.linspace(0.0, 1.0, points)))
 
 
-def clearance(samples: Samples, zones: PointingConstraint) -> jax.Array:
-    """Smallest angle [rad] between boresights and zones along a path; a bound, so between samples too.  Returns ()."""
-    looks_N = jax.vmap(jax.vmap(pointing_constraints.boresight_N, in_axes=(None, 0)), in_axes=(0, None))(
-        samples.q_BN, zones
-    )
-    at_points = jnp.min(jax.vmap(pointing_constraints.smallest_margin, in_axes=(0, None))(samples.q_BN, zones))
-    steps = jnp.max(jnp.sum((looks_N[1:] - looks_N[:-1]) ** 2, axis=-1))
+def clearance(samples: Samples, zones: PointingConstraint, timing: Timing) -> jax.Array:
+    """Smallest angle [rad] between boresights and zones along a path; a bound, so between samples too.  Returns ().
+
+    zones: as they are when the path begins.
+    """
+    then = jax.vmap(pointing_constraints.later, in_axes=(None, 0))(zones, timing.time)
+    looks_N = jax.vmap(jax.vmap(pointing_constraints.boresight_N, in_axes=(None, 0)))(samples.q_BN, then)
+    at_points = jnp.min(jax.vmap(pointing_constraints.smallest_margin)(samples.q_BN, then))
+    seen_from_axes = looks_N - then.axis_N
+    steps = jnp.max(jnp.sum((seen_from_axes[1:] - seen_from_axes[:-1]) ** 2, axis=-1))
     # A great circle between two points at equal distance from an axis dips towards it by about step^2 / 8 times the
-    # cotangent of the distance.
+    # cotangent of the distance, where that is below 90 deg.
     present = jnp.where(zones.is_present, zones.half_angle, 0.5 * jnp.pi)
-    return at_points - 0.125 * steps / jnp.tan(jnp.min(present))
+    return at_points - 0.125 * steps / jnp.tan(jnp.minimum(jnp.min(present), 0.5 * jnp.pi))
 
 
 def fastest_timing(

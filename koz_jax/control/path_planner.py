@@ -19,7 +19,7 @@ from koz_jax.control.feedback import Gain
 from koz_jax.task import dynamics, rotations
 from koz_jax.task.any_spacecraft import units
 from koz_jax.task.dynamics import RigidBodyState
-from koz_jax.task.state import EnvState, Model, torque_limits
+from koz_jax.task.state import EnvState, Model, largest_rate, torque_limits
 
 # What a path too close to a zone costs [T/rad]; more than any detour.
 _TIME_PER_SHORTFALL = 365.1484
@@ -73,13 +73,14 @@ class _Search(struct.PyTreeNode):
     needed: jax.Array  # () bool
 
 
-def _max_speed(samples: Samples, model: Model) -> jax.Array | None:
+def _max_speed(samples: Samples, state: EnvState, model: Model) -> jax.Array | None:
     """Largest ds/dt (points,) [1/s] that the shield would let pass; None without a rate limit."""
-    if model.max_rate is None:
+    largest = largest_rate(state, model)
+    if largest is None:
         return None
     form_B = dynamics.peak_rate_form(model.inertia_B)
     squared = jax.vmap(lambda slope_B: rotations.dot(slope_B, dynamics.matvec(form_B, slope_B)))(samples.slope_B)
-    return _RATE_SHARE * model.max_rate / jnp.sqrt(jnp.maximum(squared, 1e-12))
+    return _RATE_SHARE * largest / jnp.sqrt(jnp.maximum(squared, 1e-12))
 
 
 class PathPlanner(struct.PyTreeNode):
@@ -107,8 +108,8 @@ class PathPlanner(struct.PyTreeNode):
         def cost(bends_B: jax.Array) -> jax.Array:
             path = attitude_path.from_state(state.body, state.scenario.q_DN, bends_B)
             samples = attitude_path.sample(path, self.points)
-            clear = attitude_path.clearance(samples, state.scenario.constraints)
-            timing = attitude_path.fastest_timing(samples, model.inertia_B, limit_B, _max_speed(samples, model))
+            timing = attitude_path.fastest_timing(samples, model.inertia_B, limit_B, _max_speed(samples, state, model))
+            clear = attitude_path.clearance(samples, state.scenario.constraints, timing)
             return timing.duration + per_shortfall * jnp.maximum(self.margin - clear, 0.0)
 
         per_shortfall = _TIME_PER_SHORTFALL * units.of(model).time
@@ -116,7 +117,7 @@ class PathPlanner(struct.PyTreeNode):
         bends_B = self._search(cost, self._first_bends(state), key_search)
         path = attitude_path.from_state(state.body, state.scenario.q_DN, bends_B)
         samples = attitude_path.sample(path, self.points)
-        timing = attitude_path.fastest_timing(samples, model.inertia_B, limit_B, _max_speed(samples, model))
+        timing = attitude_path.fastest_timing(samples, model.inertia_B, limit_B, _max_speed(samples, state, model))
         return Plan(path, timing, jnp.zeros(()), key)
 
     def _search(self, cost: Callable[[jax.Array], jax.Array], first_B: jax.Array, key: jax.Array) -> jax.Array:

@@ -219,6 +219,9 @@ def fly_scenario(
     maneuver.tell_of_another_boresight(right, flown.spacecraft.boresight)
     cautions.warn_of_differences(flying, flown)
     cautions.warn_of_target(flying, right, how.shield)
+    rates = right.constraints.axis_rate_N
+    if how.shield is not None and rates is not None:
+        how.shield.check_cones(float(np.rad2deg(np.linalg.norm(rates, axis=1).max())))
     flight = _flight(flying.controller, flown, how).of_case(case)
     return _keep_and_evaluate(flight, right, flight.flight_key(case))
 

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from koz_jax.config.maneuvers.maneuver import ManeuverConfig
+from koz_jax.config.maneuvers.maneuver_tables import ConstraintConfig
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.task import TaskConfig
 from koz_jax.control.base import TaskController
@@ -33,6 +34,9 @@ class FlownManeuver:
     result: CaseResult
     margins_deg: np.ndarray  # (constraints,) [deg] smallest margin to each, those that are absent left out
     peak_rate_deg: float  # [deg/s] largest norm of the body rate
+    peak_momentum_share: float | None = (
+        None  # of the wheels' limits, the most that any of them held; None without wheels
+    )
 
     def report(self) -> dict[str, Any]:
         """What ``koz fly --json`` writes; None stands for what there is not."""
@@ -45,7 +49,9 @@ class FlownManeuver:
             "end_error_deg": _number(np.rad2deg(result.control_accuracy)),
             "min_margin_deg": _number(self.margins_deg.min()) if len(self.margins_deg) else None,
             "peak_rate_deg": _number(self.peak_rate_deg),
-            "peak_wheel_momentum_share": None,
+            "peak_wheel_momentum_share": None
+            if self.peak_momentum_share is None
+            else _number(self.peak_momentum_share),
             "intervention_rate": _number(result.intervention_rate),
             "deadlocked": bool(result.deadlocked),
             "margins_deg": [_number(margin) for margin in self.margins_deg],
@@ -62,17 +68,27 @@ def scenario(maneuver: ManeuverConfig) -> Scenario:
     return maneuvers.maneuver(
         maneuver.start.attitude,
         maneuver.aim.attitude,
-        [(*one.keep_out_cone, maneuver.boresight(one.instrument)) for one in maneuver.constraints],
+        [_zone(maneuver, one) for one in maneuver.constraints],
         boresight=maneuver.task.spacecraft.boresight,
         rate_deg=maneuver.start.rate_deg,
     )
 
 
+def _zone(maneuver: ManeuverConfig, one: ConstraintConfig) -> tuple[Any, ...]:
+    """A zone as ``task.maneuver`` takes it."""
+    cone = one.keep_out_cone
+    return cone.direction, cone.half_angle_deg, maneuver.boresight(one.instrument), cone.rotation_deg
+
+
 def config_of(maneuver: ManeuverConfig, config: MonteCarloConfig) -> MonteCarloConfig:
-    """Conditions of a flight with the maneuver's errors, checked as closely as maneuvers are."""
+    """Conditions of a flight with the errors of a maneuver and the rates of its cones, checked closely."""
     changes: dict[str, Any] = {"substeps": max(SUBSTEPS, config.substeps)}
     if maneuver.has_errors:
         changes["uncertainty"] = maneuver.errors.uncertainty
+    if config.shield is not None:
+        fastest = max((float(np.linalg.norm(one.rotation_deg)) for one in maneuver.constraints), default=0.0)
+        cone_rate = max(fastest, config.shield.cone_rate_deg)
+        changes["shield"] = config.shield.model_copy(update={"cone_rate_deg": cone_rate})
     return config.model_copy(update=changes)
 
 
@@ -93,15 +109,36 @@ def fly_closely(
     """``cases.fly_scenario``, with what each constraint came to at the settings' ``substeps`` of every step."""
     history, result = cases.fly_scenario(agent, drawn, task, config, case)
     bodies = cases.within_steps(history, task, config, case)
-    margins, rate = _worst(bodies, drawn.constraints)
+    margins, rate = _worst(bodies, drawn.constraints, jnp.float32(task.step_seconds / config.substeps))
     present = np.asarray(drawn.constraints.is_present)
-    return FlownManeuver(history, result, np.rad2deg(np.asarray(margins)[present]), float(np.rad2deg(rate)))
+    return FlownManeuver(
+        history,
+        result,
+        np.rad2deg(np.asarray(margins)[present]),
+        float(np.rad2deg(rate)),
+        _momentum_share(history, task),
+    )
+
+
+def _momentum_share(history: History, task: TaskConfig) -> float | None:
+    wheels = task.spacecraft.wheels
+    if not wheels:
+        return None
+    limits = np.array([wheel.max_momentum for wheel in wheels])
+    return float((np.abs(np.asarray(history.state.actuators)) / limits).max())
 
 
 @jax.jit
-def _worst(bodies: RigidBodyState, constraints: PointingConstraint) -> tuple[jax.Array, jax.Array]:
-    """bodies: leaves (instants, ...).  Returns margins (constraints,) [rad] and a rate () [rad/s]."""
-    margins = jax.vmap(pointing_constraints.margins, in_axes=(0, None))(bodies.q_BN, constraints)
+def _worst(bodies: RigidBodyState, constraints: PointingConstraint, apart: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Smallest margin to each constraint, and the largest rate.
+
+    bodies: leaves (instants, ...); apart: () [s] between the instants.  Returns (constraints,) [rad] and () [rad/s].
+    """
+
+    def margins_at(q_BN: jax.Array, instant: jax.Array) -> jax.Array:
+        return pointing_constraints.margins(q_BN, pointing_constraints.later(constraints, instant * apart))
+
+    margins = jax.vmap(margins_at)(bodies.q_BN, jnp.arange(len(bodies.q_BN)))
     return jnp.min(margins, axis=0), jnp.max(jax.vmap(rotations.norm)(bodies.omega_BN_B))
 
 
@@ -115,10 +152,11 @@ def describe(maneuver: ManeuverConfig, flown: FlownManeuver) -> str:
         chosen = f"rolled by {maneuver.aim.roll_deg:+.1f} deg, clear of all cones" if maneuver.aim.roll_deg else "as is"
         lines.append(f"target: the roll that the smallest rotation gives, {chosen}; attitude {_row(maneuver)}")
     for i, (one, margin) in enumerate(zip(maneuver.constraints, flown.margins_deg, strict=True)):
-        lines.append(f"constraints.{i}: {one.instrument} {margin:.4g} deg outside {one.half_angle_deg:g} deg")
+        cone = f"{one.half_angle_deg:g} deg" + (" to be kept in" if one.kind == "keep_in" else "")
+        lines.append(f"constraints.{i}: {one.instrument} {margin:.4g} deg {one.allowed_side} {cone}")
     looking = list(dict.fromkeys(one.instrument for one in maneuver.constraints))
     if len(looking) > 1:
-        lines.append(f"pictures show where {looking[0]} looks, not {', '.join(looking[1:])}")
+        lines.append(f"pictures show where {looking[0]} looks and its cones, not {', '.join(looking[1:])}")
     return "\n".join([*lines, *_comparison(maneuver, flown)])
 
 

@@ -6,6 +6,7 @@ from flax import struct
 
 from koz_jax.control.base import Controller, Memory
 from koz_jax.task import reward, rotations
+from koz_jax.task.actuators import ActuatorState
 from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.environment import Reorientation
 from koz_jax.task.reward import RewardTerms
@@ -100,10 +101,11 @@ def _step(env: Reorientation, controller: Controller, flight: _Flight) -> tuple[
 def _smallest_margin(env: Reorientation, before: _Flight, stepped: Step, substeps: int) -> jax.Array:
     """Smallest margin of a step: at its end, and at ``substeps - 1`` instants inside it.  Returns () [rad]."""
     margins = [stepped.outcome.zone_margin]
+    held_B = env.model.actuators.stored_momentum(before.state.actuators)
     for i in range(1, substeps):
         seconds = env.model.dt * (i / substeps)
-        body = propagate(before.state.body, stepped.state.torque_B, before.truth, seconds)
-        margins.append(env.margin(before.state.replace(body=body)))
+        body = propagate(before.state.body, stepped.state.torque_B, before.truth, seconds, held_B)
+        margins.append(env.margin(before.state.replace(body=body, scenario=before.state.scenario.after(seconds))))
     return jnp.min(jnp.stack(margins))
 
 
@@ -256,12 +258,13 @@ def within_steps(env: Reorientation, history: History, substeps: int, key: jax.A
     truth = env.sample_truth(_split(jax.random.key(0) if key is None else key)[1])
     bodies = history.state.body
 
-    def of_a_step(body: RigidBodyState, torque_B: jax.Array) -> RigidBodyState:
+    def of_a_step(body: RigidBodyState, torque_B: jax.Array, actuators: ActuatorState) -> RigidBodyState:
         seconds = env.model.dt * jnp.arange(substeps) / substeps
-        return jax.vmap(propagate, in_axes=(None, None, None, 0))(body, torque_B, truth, seconds)
+        held_B = env.model.actuators.stored_momentum(actuators)
+        return jax.vmap(propagate, in_axes=(None, None, None, 0, None))(body, torque_B, truth, seconds, held_B)
 
-    before = jax.tree.map(lambda leaf: leaf[:-1], bodies)
-    inside = jax.vmap(of_a_step)(before, history.torque_B[:-1])
+    before, actuators = jax.tree.map(lambda leaf: leaf[:-1], (bodies, history.state.actuators))
+    inside = jax.vmap(of_a_step)(before, history.torque_B[:-1], actuators)
     return jax.tree.map(
         lambda rows, whole: jnp.concatenate([rows.reshape(-1, *rows.shape[2:]), whole[-1:]]), inside, bodies
     )

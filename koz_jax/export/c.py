@@ -12,6 +12,7 @@ from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import TaskConfig
 from koz_jax.control.shield import brake_path, guide, rate_limit
 from koz_jax.control.shield import filter as shield
+from koz_jax.errors import SettingsError
 from koz_jax.export import c_network, c_observation, c_text
 from koz_jax.export.golden import EXAMPLE_CASE, Golden
 from koz_jax.export.metadata import Metadata, as_text
@@ -67,7 +68,14 @@ def c_files(policy: NumpyPolicy, metadata: Metadata, vectors: Golden, example: n
 
 
 def shield_files(metadata: Metadata, config: ShieldConfig, vectors: ShieldGolden) -> dict[str, bytes]:
-    """Header, source and self-test of a shield for the spacecraft of an exported policy, by file name."""
+    """Header, source and self-test of a shield for the spacecraft of an exported policy, by file name.
+
+    Raises:
+        SettingsError: it is to keep out of cones that turn.
+
+    """
+    if config.cone_rate_deg:
+        raise SettingsError(f"cone_rate_deg: is not exported yet; allowed is 0, got {config.cone_rate_deg:g}")
     model = environment.model_from_config(metadata.task)
     made = shield.from_config(config, model)
     replacements = {

@@ -156,6 +156,6 @@ def _torque(
     def one(situation: Situation, action: jax.Array) -> jax.Array:
         at = situation.state(model, boresight_B)
         command = nondimensional.command(action, at, model) if network.scaled else action
-        return model.actuators.apply(command, at.actuators)[0]
+        return model.actuators.apply(command, at.actuators, at.body.omega_BN_B, model.inertia_B, model.dt)[0]
 
     return jax.vmap(one)(drawn, action)

@@ -11,6 +11,7 @@ from koz_jax.config.base import Settings, Vector
 from koz_jax.config.task import ScenarioConfig, TaskConfig
 from koz_jax.config.training import NetworkConfig
 from koz_jax.config.version import version
+from koz_jax.errors import SettingsError
 from koz_jax.task.any_spacecraft import constants
 from koz_jax.task.observation_layout import layout, meaning, slices
 
@@ -79,9 +80,15 @@ def describe(policy: NumpyPolicy, task: TaskConfig | None = None, urgency: float
 
     task: with the spacecraft that it is exported for, by default its own; urgency: where none is set, of a policy that
     sees one.
+
+    Raises:
+        SettingsError: the spacecraft has wheels.
+
     """
     record = policy.record
     task = task or record.task
+    if task.spacecraft.wheels:
+        raise SettingsError("spacecraft.wheels: are not exported yet; allowed is torque_limit")
     zones, scaled = record.network.observed_zones, record.network.scaled
     where = slices(zones, scaled)
     limits = task.spacecraft.torque_limits

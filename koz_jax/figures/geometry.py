@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from koz_jax.config import attitudes
 from koz_jax.evaluation.rollout import History
 from koz_jax.task import rotations
 
@@ -19,13 +20,37 @@ class Zone:
 
     axis_N: np.ndarray  # (3,) unit vector
     half_angle: float  # [rad]
+    last_axis_N: np.ndarray | None = None  # (3,) axis at the end of the maneuver; None where it does not turn
+
+    @property
+    def size(self) -> str:
+        """How large it is, for legends; of more than half of the sphere, the cone that is left."""
+        half_angle_deg = np.rad2deg(self.half_angle)
+        if half_angle_deg > 90.0:
+            return f"kept in {180.0 - half_angle_deg:.1f}°"
+        return f"half angle {half_angle_deg:.1f}°"
 
 
 def zones(history: History) -> list[Zone]:
-    """The zones of a maneuver; stand-ins for "no zone" are left out."""
-    stacked = jax.tree.map(lambda leaf: np.asarray(leaf[0], np.float64), history.state.scenario.constraints)
-    pairs = zip(stacked.axis_N, stacked.half_angle, strict=True)
-    return [Zone(axis_N / np.linalg.norm(axis_N), float(angle)) for axis_N, angle in pairs if angle > 0.0]
+    """The zones of the telescope as they are at the start; stand-ins for "no zone" are left out.
+
+    Where other instruments look is not drawn, so their zones are left out too.
+    """
+    first, last = (
+        jax.tree.map(lambda leaf, at=at: np.asarray(leaf[at], np.float64), history.state.scenario.constraints)
+        for at in (0, -1)
+    )
+    turns = first.axis_rate_N is not None and np.any(first.axis_rate_N, axis=1)
+    turns = np.broadcast_to(turns, first.half_angle.shape)
+    own = np.all(np.isclose(first.boresight_B, first.boresight_B[0]), axis=1)
+    return [
+        Zone(
+            attitudes.normalized(first.axis_N[i]),
+            float(first.half_angle[i]),
+            attitudes.normalized(last.axis_N[i]) if turns[i] else None,
+        )
+        for i in np.flatnonzero(own & (first.half_angle > 0.0))
+    ]
 
 
 def zone_names(found: list[Zone]) -> list[str]:

@@ -43,9 +43,10 @@ def draw_scene(axes: Axes, traces: SphereTraces, pixels: int = _PIXELS) -> None:
         axes.plot(*front.T, color="#9A9A9A", linewidth=0.4, zorder=1)
     _draw_axes_of_space(axes, traces.view)
     for name, zone, circle in zip(geometry.zone_names(traces.zones), traces.zones, traces.circles_N, strict=True):
-        draw_line(
-            axes, traces.view, circle, palette.ZONE, 1.8, f"{name}, half angle {np.rad2deg(zone.half_angle):.1f}°"
-        )
+        draw_line(axes, traces.view, circle, palette.ZONE, 1.8, f"{name}, {zone.size}")
+        if zone.last_axis_N is not None:
+            last = geometry.zone_circle(Zone(zone.last_axis_N, zone.half_angle))
+            draw_line(axes, traces.view, last, palette.ZONE, 0.9, f"{name} at the end")
         if len(traces.zones) > 1:
             _number_zone(axes, traces.view, zone, name.removeprefix("zone "))
     label = f"shortest path ({np.rad2deg(traces.deviation):.0f}° rotation)"

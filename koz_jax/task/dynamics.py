@@ -14,6 +14,13 @@ class RigidBodyState(struct.PyTreeNode):
     omega_BN_B: jax.Array  # (3,) [rad/s], body relative to inertial, in body axes
 
 
+class StoredMomentum(struct.PyTreeNode):
+    """Angular momentum that turns with the body beside its own, as of wheels."""
+
+    momentum_B: jax.Array  # (3,) [N m s] now
+    torque_B: jax.Array  # (3,) [N m] that it gives to the body, at its own cost
+
+
 @jax.jit
 def matvec(matrix: jax.Array, vector: jax.Array) -> jax.Array:
     """Matrix times vector, as a sum of columns.  matrix: (3, 3), vector: (3,).  Returns (3,)."""
@@ -65,26 +72,38 @@ def attitude_rate(q_BN: jax.Array, omega_BN_B: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def step(state: RigidBodyState, torque_B: jax.Array, inertia_B: jax.Array, dt: jax.Array | float) -> RigidBodyState:
+def step(
+    state: RigidBodyState,
+    torque_B: jax.Array,
+    inertia_B: jax.Array,
+    dt: jax.Array | float,
+    stored: StoredMomentum | None = None,
+) -> RigidBodyState:
     """One Runge-Kutta step of order 4 with the torque held (zero-order hold), attitude renormalised.
 
-    torque_B: (3,) [N m]; inertia_B: (3, 3) [kg m^2]; dt: () [s].
+    torque_B: (3,) [N m], all of it; inertia_B: (3, 3) [kg m^2], with wheels as dead weight; dt: () [s].  Stored
+    momentum h adds the gyroscopic torque w x h.
     """
     inverse_B = inverse(inertia_B)
 
-    def derivative(at: RigidBodyState) -> RigidBodyState:
+    def net(at: RigidBodyState, seconds: jax.Array | float) -> jax.Array:
+        if stored is None:
+            return torque_B
+        return torque_B - rotations.cross(at.omega_BN_B, stored.momentum_B - seconds * stored.torque_B)
+
+    def derivative(at: RigidBodyState, seconds: jax.Array | float) -> RigidBodyState:
         return RigidBodyState(
             attitude_rate(at.q_BN, at.omega_BN_B),
-            angular_acceleration(at.omega_BN_B, torque_B, inertia_B, inverse_B),
+            angular_acceleration(at.omega_BN_B, net(at, seconds), inertia_B, inverse_B),
         )
 
     def ahead(slope: RigidBodyState, h: jax.Array | float) -> RigidBodyState:
         return jax.tree.map(lambda x, dx: x + h * dx, state, slope)
 
-    k1 = derivative(state)
-    k2 = derivative(ahead(k1, 0.5 * dt))
-    k3 = derivative(ahead(k2, 0.5 * dt))
-    k4 = derivative(ahead(k3, dt))
+    k1 = derivative(state, 0.0)
+    k2 = derivative(ahead(k1, 0.5 * dt), 0.5 * dt)
+    k3 = derivative(ahead(k2, 0.5 * dt), 0.5 * dt)
+    k4 = derivative(ahead(k3, dt), dt)
     mean_slope = jax.tree.map(lambda a, b, c, d: (a + 2.0 * (b + c) + d) / 6.0, k1, k2, k3, k4)
     end = ahead(mean_slope, dt)
     return RigidBodyState(rotations.normalize(end.q_BN), end.omega_BN_B)

@@ -102,7 +102,7 @@ class Reorientation(struct.PyTreeNode):
     @property
     def nominal_limits(self) -> TorqueLimits:
         """Torques that can be asked for at the start of a maneuver; rewards count torques in shares of them."""
-        return self.model.actuators.limits(self.model.actuators.initial_state())
+        return state.nominal_limits(self.model)
 
     def sample(self, key: jax.Array) -> Scenario:
         """Draw a scenario.  key: () typed PRNG key."""
@@ -178,7 +178,8 @@ class Reorientation(struct.PyTreeNode):
         if self.scaled:
             action = nondimensional.command(jnp.clip(action, -1.0, 1.0), known, self.model)
         command = self.filter(known, action)
-        after, outcome = self._advance(before, command, state.nominal(self.model) if truth is None else truth)
+        flown = state.nominal(self.model) if truth is None else truth
+        after, outcome = self._advance(before, known, command, flown)
         observed = self.observe(after if noise is None else self.measure(after, noise))
         return Step(
             state=after,
@@ -191,11 +192,14 @@ class Reorientation(struct.PyTreeNode):
             truncated=after.steps >= self.episode_steps,
         )
 
-    def _advance(self, before: EnvState, command: Command, truth: Truth) -> tuple[EnvState, Outcome]:
+    def _advance(self, before: EnvState, known: EnvState, command: Command, truth: Truth) -> tuple[EnvState, Outcome]:
         now, on_the_way = state.delayed(command.applied, before.on_the_way, truth.delay)
-        torque_B, actuator_state = self.model.actuators.apply(now, before.actuators)
+        actuators, inertia_B, dt = self.model.actuators, self.model.inertia_B, self.model.dt
+        torque_B, actuator_state = actuators.apply(now, before.actuators, known.body.omega_BN_B, inertia_B, dt)
+        held_B = actuators.stored_momentum(before.actuators)
         after = before.replace(
-            body=state.propagate(before.body, torque_B, truth, self.model.dt),
+            body=state.propagate(before.body, torque_B, truth, dt, held_B),
+            scenario=before.scenario.after(dt),
             q_e0_previous=attitude_error(before)[0],
             torque_B=torque_B,
             steps=before.steps + 1,

@@ -70,8 +70,10 @@ def half_angle(name: str, given: npt.ArrayLike) -> float:
     return radians
 
 
-def cones(zones: Sequence[Any], boresight: npt.ArrayLike) -> Cones:
+def cones(zones: Sequence[Any], boresight: npt.ArrayLike, turning: bool = False) -> Cones:
     """Check zones as people give them: pairs (axis, half angle [deg]), or triples that end in a boresight.
+
+    turning: a fourth part may be the rate of the axis, see ``axis_rates``.
 
     zones: axes in inertial axes; boresight: in body axes, of the pairs.  None at all is one stand-in for no zone.
 
@@ -84,19 +86,34 @@ def cones(zones: Sequence[Any], boresight: npt.ArrayLike) -> Cones:
     for number, zone in enumerate(zones):
         name = f"zones[{number}]"
         parts: list[Any] = list(zone) if isinstance(zone, Sequence) else []
-        if len(parts) not in (2, 3):
+        if not 2 <= len(parts) <= (4 if turning else 3):
+            further = " or (axis, half angle, boresight, rate of the axis [deg/s])" if turning else ""
             raise SettingsError(
-                f"{name}: must be (axis, half angle [deg]) or (axis, half angle, boresight), got {zone!r}"
+                f"{name}: must be (axis, half angle [deg]) or (axis, half angle, boresight){further}, got {zone!r}"
             )
         degrees = float(numbers(f"{name}, half angle", parts[1], ()))
         if not 0.0 < degrees < 180.0:
             raise SettingsError(f"{name}, half angle: must be above 0 and below 180 deg, got {degrees:.6g}")
-        own_B = unit(f"{name}, boresight", parts[2], 3) if len(parts) == 3 else looks_B
+        own_B = unit(f"{name}, boresight", parts[2], 3) if len(parts) > 2 else looks_B
         rows.append((own_B, unit(f"{name}, axis", parts[0], 3), float(np.deg2rad(degrees))))
     if not rows:
         rows.append((looks_B, np.array([1.0, 0.0, 0.0]), ABSENT_HALF_ANGLE))
     boresights, axes, angles = zip(*rows, strict=True)
     return Cones(np.stack(boresights), np.stack(axes), np.array(angles))
+
+
+def axis_rates(zones: Sequence[Any]) -> Floats | None:
+    """Rates of the axes of zones that ``cones`` has checked.  Returns (n, 3) [rad/s]; None where no axis turns.
+
+    Raises:
+        SettingsError: a rate is not finite or has another shape.
+
+    """
+    rates = [
+        numbers(f"zones[{number}], rate", zone[3], (3,)) if len(zone) > 3 else np.zeros(3)
+        for number, zone in enumerate(zones)
+    ]
+    return np.deg2rad(np.stack(rates)) if np.any(rates) else None
 
 
 def nearer(q: Floats, reference: Floats) -> Floats:

@@ -36,7 +36,7 @@ def maneuver(
         target: attitude at the end, in the same way; of it and its negative, which are one attitude, the nearer is
             flown to.
         zones: keep-out zones, each a pair (axis (3,) in inertial axes, half angle [deg]), or a triple with the
-            boresight (3,) of another instrument at its end.
+            boresight (3,) of another instrument, or four with the angular velocity of the axis (3,) [deg/s], inertial.
         boresight: of the instrument of the pairs, in body axes (3,); that of the spacecraft that flies.
         rate_deg: rate at the start, relative to inertial in body axes (3,) [deg/s].
 
@@ -45,9 +45,11 @@ def maneuver(
             off 1 by more than 1 % (what is off by less is normalised); a half angle is not above 0 and below 180 deg.
 
     """
-    stack = host.cones(zones, boresight)
+    stack = host.cones(zones, boresight, turning=True)
     omega_BN_B = np.deg2rad(host.numbers("rate_deg", rate_deg, (3,)))
-    right = _scenario(host.unit("start", start, 4), omega_BN_B, host.unit("target", target, 4), stack)
+    right = _scenario(
+        host.unit("start", start, 4), omega_BN_B, host.unit("target", target, 4), stack, host.axis_rates(zones)
+    )
     return jax.tree.map(jnp.asarray, right)
 
 
@@ -71,7 +73,10 @@ def checked(drawn: Scenario) -> Scenario:
     stack = _checked_stack(drawn.constraints)
     _tell_of_zones_around("start", q_BN, stack)
     _tell_of_zones_around("target", q_DN, stack)
-    right = _scenario(q_BN, omega_BN_B, q_DN, stack)
+    rates = drawn.constraints.axis_rate_N
+    if rates is not None:
+        rates = host.numbers("constraints.axis_rate_N", rates, stack.axis_N.shape)
+    right = _scenario(q_BN, omega_BN_B, q_DN, stack, rates)
     chosen = [_choose(new, given) for new, given in zip(_leaves(right), _leaves(drawn), strict=True)]
     return jax.tree.unflatten(jax.tree.structure(right), chosen)
 
@@ -112,9 +117,11 @@ def _tell_of_zones_around(what: str, q_BN: host.Floats, zones: Cones) -> None:
             )
 
 
-def _scenario(q_BN: host.Floats, omega_BN_B: host.Floats, q_DN: host.Floats, zones: Cones) -> Scenario:
+def _scenario(
+    q_BN: host.Floats, omega_BN_B: host.Floats, q_DN: host.Floats, zones: Cones, axis_rate_N: host.Floats | None
+) -> Scenario:
     """Put a scenario together.  Returns NumPy leaves, float32."""
-    leaves = (q_BN, omega_BN_B, host.nearer(q_DN, q_BN), *zones)
+    leaves = (q_BN, omega_BN_B, host.nearer(q_DN, q_BN), *zones, *(() if axis_rate_N is None else (axis_rate_N,)))
     start, rate, target, *stack = (np.asarray(leaf, np.float32) for leaf in leaves)
     return Scenario(RigidBodyState(start, rate), target, PointingConstraint(*stack))  # pyright: ignore
 
@@ -127,4 +134,5 @@ def _choose(right: np.ndarray, given: Any) -> jax.Array:
 
 def _leaves(drawn: Scenario) -> list[Any]:
     zones, body = drawn.constraints, drawn.initial
-    return [body.q_BN, body.omega_BN_B, drawn.q_DN, zones.boresight_B, zones.axis_N, zones.half_angle]
+    fixed = [body.q_BN, body.omega_BN_B, drawn.q_DN, zones.boresight_B, zones.axis_N, zones.half_angle]
+    return fixed if zones.axis_rate_N is None else [*fixed, zones.axis_rate_N]

@@ -35,8 +35,7 @@ def nearest_constraints(state: EnvState, count: int) -> PointingConstraint:
         order = jnp.argsort(pointing_constraints.margins(state.body.q_BN, zones))[:count]
         zones = jax.tree.map(lambda leaf: leaf[order], zones)
     if count > present:
-        filling = pointing_constraints.absent(count - present, zones.boresight_B[0])
-        zones = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), zones, filling)
+        zones = pointing_constraints.filled_up(zones, count)
     return zones
 
 

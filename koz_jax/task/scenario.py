@@ -64,7 +64,11 @@ class Scenario(struct.PyTreeNode):
 
     initial: RigidBodyState
     q_DN: jax.Array  # (4,) desired attitude, relative to inertial
-    constraints: PointingConstraint  # stacked along a leading axis
+    constraints: PointingConstraint  # stacked along a leading axis; in the state of a maneuver, as they are now
+
+    def after(self, seconds: jax.Array | float) -> "Scenario":
+        """The same a time () [s] later, when the axes of constraints have turned."""
+        return self.replace(constraints=pointing_constraints.later(self.constraints, seconds))
 
 
 class _Draw(struct.PyTreeNode):
@@ -171,8 +175,7 @@ def _add_zones(
             half_angle=zones.half_angle.at[i].set(jnp.where(wanted, half_angle, ABSENT_HALF_ANGLE)),
         )
 
-    empty = pointing_constraints.absent(ranges.max_zones - 1, ranges.boresight_B)
-    zones = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), first, empty)
+    zones = pointing_constraints.filled_up(first, ranges.max_zones)
     return jax.lax.fori_loop(1, ranges.max_zones, add, zones)
 
 

@@ -1,5 +1,6 @@
 """What a maneuver is made of: the model that controllers and shield know, the truth that flies, states and steps."""
 
+import functools
 from typing import Protocol, TypeVar
 
 import jax
@@ -111,7 +112,27 @@ def attitude_error(state: EnvState) -> jax.Array:
 
 def torque_limits(state: EnvState, model: Model) -> TorqueLimits:
     """Torques that can be asked for in this state."""
-    return model.actuators.limits(state.actuators)
+    return model.actuators.limits(state.actuators, state.body.omega_BN_B)
+
+
+def nominal_limits(model: Model) -> TorqueLimits:
+    """Torques that can be asked for at the start of a maneuver, at rest."""
+    return model.actuators.limits(model.actuators.initial_state(), jnp.zeros(3))
+
+
+def largest_rate(state: EnvState, model: Model) -> jax.Array | None:
+    """Largest norm of the rate [rad/s] that the spacecraft may have and its actuators can stop; None for any."""
+    return _least(model, model.actuators.largest_rate(state.actuators, state.body.omega_BN_B, model.inertia_B))
+
+
+def nominal_rate(model: Model) -> jax.Array | None:
+    """The same at the start of a maneuver, at rest."""
+    return _least(model, model.actuators.largest_rate(model.actuators.initial_state(), jnp.zeros(3), model.inertia_B))
+
+
+def _least(model: Model, of_actuators: jax.Array | None) -> jax.Array | None:
+    known = [rate for rate in (model.max_rate, of_actuators) if rate is not None]
+    return functools.reduce(jnp.minimum, known) if known else None
 
 
 def nominal(model: Model) -> Truth:
@@ -133,9 +154,15 @@ def delayed(
     return given[delay], given[:-1]
 
 
-def propagate(body: RigidBodyState, torque_B: jax.Array, truth: Truth, seconds: jax.Array) -> RigidBodyState:
-    """What a held torque (3,) [N m] makes of the body in a time () [s], disturbance included."""
-    return dynamics.step(body, torque_B + truth.disturbance_B, truth.inertia_B, seconds)
+def propagate(
+    body: RigidBodyState, torque_B: jax.Array, truth: Truth, seconds: jax.Array, held_B: jax.Array | None = None
+) -> RigidBodyState:
+    """What a held torque (3,) [N m] makes of the body in a time () [s], disturbance included.
+
+    held_B: (3,) [N m s] momentum that the actuators hold, and that pays for the torque; None where they hold none.
+    """
+    stored = None if held_B is None else dynamics.StoredMomentum(held_B, torque_B)
+    return dynamics.step(body, torque_B + truth.disturbance_B, truth.inertia_B, seconds, stored)
 
 
 def select_envs(mask: jax.Array, chosen: Tree, otherwise: Tree) -> Tree:

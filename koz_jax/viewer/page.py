@@ -77,7 +77,7 @@ def describe(maneuvers: list[Maneuver], at: Clock) -> str:
     parts = [f"{np.rad2deg(float(first.result.initial_angle)):.1f}° from the target"]
     zones = geometry.zones(first.history)
     named = zip(geometry.zone_names(zones), zones, strict=True)
-    parts += [f"{name} of {np.rad2deg(zone.half_angle):.1f}° half angle" for name, zone in named]
+    parts += [f"{name}, {zone.size}" for name, zone in named]
     longest = max(maneuver.seconds for maneuver in maneuvers)
     if longest > at.times[-1] + 1e-6:
         parts.append(f"the first {at.times[-1]:g} s of {longest:g} s")

@@ -28,7 +28,8 @@ def flown(at, model, urgency):
     """What the core sees, decides and applies."""
     seen = nondimensional.observe(at, model, urgency)
     action = AGENT.controller.act(seen)
-    torque_B, _ = model.actuators.apply(nondimensional.command(action, at, model), None)
+    command = nondimensional.command(action, at, model)
+    torque_B, _ = model.actuators.apply(command, None, at.body.omega_BN_B, model.inertia_B, model.dt)
     return seen, action, torque_B
 
 

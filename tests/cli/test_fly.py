@@ -164,7 +164,7 @@ REFUSED_TURNS = {
     "quaternion": (("--from", 1, 1, 0, 0, "--to", 1, 0, 0, 0), "from: must be a unit quaternion, scalar first"),
     "cone": ((*TURN, "--keep-out", 3, 4, 0, 20), "keep_out.0.direction: must be a unit vector, of length 1"),
     "half angle": ((*TURN, "--keep-out", 0, 1, 0, 200), "keep_out.0.half_angle_deg: Input should be less than 180"),
-    "start inside": ((*TURN, "--keep-out", 1, 0, 0, 20), "from: must keep every instrument outside its cones"),
+    "start inside": ((*TURN, "--keep-out", 1, 0, 0, 20), "from: must keep every constraint"),
     "no body": ((*TURN, "--spacecraft", "no.toml"), "spacecraft: no.toml cannot be read"),
     "urgency": ((CUBESAT, "--agent", "phase2", "--urgency", 0.2), "urgency: phase2 was trained for one trade"),
     "hurried law": ((CUBESAT, "--controller", "pd", "--urgency", 1), "urgency: is of agents, and pd has none"),

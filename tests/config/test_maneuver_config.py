@@ -158,10 +158,34 @@ def test_where_the_smallest_rotation_ends_inside_a_constraint_the_nearest_roll_t
     )
 
 
+def test_to_be_kept_in_a_cone_is_to_be_kept_out_of_the_rest_of_the_sphere():
+    inside = {"instrument": "telescope", "kind": "keep_in", "direction": (0.6, 0.0, 0.8), "half_angle_deg": 100.0}
+    found = pointing((1.0, 0.0, 0.0), constraints=[inside])
+    for attitude in (found.start.attitude, found.aim.attitude):
+        look = attitudes.rotate(np.array(attitude), np.array([0.0, 0.0, 1.0]))
+        expected = 100.0 - np.rad2deg(attitudes.angle_between(look, np.array([0.6, 0.0, 0.8])))
+        np.testing.assert_allclose(found.margins_deg(np.array(attitude)), expected, atol=1e-9)
+
+
+def test_the_target_must_be_clear_when_the_maneuver_ends():
+    """A cone that turns about z by 90 deg while the telescope turns from +z to +x."""
+    turning = {"instrument": "telescope", "half_angle_deg": 30.0, "rotation_deg": (0.0, 0.0, 0.9)}
+    away = pointing((1.0, 0.0, 0.0), constraints=[{**turning, "direction": (1.0, 0.0, 0.0)}], duration_seconds=100.0)
+    np.testing.assert_allclose(away.constraints[0].keep_out_cone.axis_after(100.0), (0.0, 1.0, 0.0), atol=1e-12)
+    np.testing.assert_allclose(away.margins_deg(np.array(away.aim.attitude), 100.0), 60.0, atol=1e-9)
+    entered = {"constraints": [{**turning, "direction": (0.0, -1.0, 0.0)}], "duration_seconds": 100.0}
+    with pytest.raises(ValueError, match=r"target.direction: no roll about it keeps every constraint"):
+        pointing((1.0, 0.0, 0.0), **entered)
+    with pytest.raises(ValueError, match=r"target.attitude: .* inside constraints.0 after 100 s, a keep_out cone"):
+        made(target={"attitude": (0.5**0.5, 0.0, 0.5**0.5, 0.0)}, **entered)
+
+
 # --- what is refused ---
 
 ATTITUDE, DIRECTION = "attitude = [1, 0, 0, 0]", "direction = [0, 1, 0]"
 TARGET = "attitude = [0.5, 0.5, 0.5, 0.5]"
+
+WHEEL = "[[spacecraft.wheels]]\naxis = {}\nmax_torque = 0.002\nmax_momentum = 0.015\n"
 
 # A change of the file, and words of the message: the key, the value, what is allowed.
 REFUSED = {
@@ -188,28 +212,43 @@ REFUSED = {
     ),
     "wheels": (
         "torque_limit = 0.004",
-        "torque_limit = 0.004\n[[spacecraft.wheels]]\naxis = [1, 0, 0]",
-        "spacecraft.wheels: not supported yet; allowed is torque_limit",
+        "torque_limit = 0.004\n" + WHEEL.format("[1, 0, 0]") * 3,
+        "spacecraft: torque_limit: must be given where there are no wheels, and only there; got both",
+    ),
+    "no actuators": (
+        "torque_limit = 0.004",
+        "",
+        "spacecraft: torque_limit: must be given where there are no wheels, and only there; got neither",
+    ),
+    "half a wheel": (
+        "torque_limit = 0.004",
+        "[[spacecraft.wheels]]\naxis = [1, 0, 0]\nmax_torque = 0.002",
+        "spacecraft.wheels.0.max_momentum: Field required",
+    ),
+    "wheels in a plane": (
+        "torque_limit = 0.004",
+        WHEEL.format("[1, 0, 0]") * 2 + WHEEL.format("[0, 1, 0]"),
+        "wheels must be at least three, with axes that do not lie in a plane",
     ),
     "rate limit": (
         "torque_limit = 0.004",
         "torque_limit = 0.004\nmax_rate_deg = -3.0",
         "spacecraft.max_rate_deg: Input should be greater than 0",
     ),
-    "keep in": (
+    "outside the cone to be kept in": (
         'kind = "keep_out"',
         'kind = "keep_in"',
-        "constraints.0.kind: not supported yet; allowed is 'keep_out' (got 'keep_in')",
+        "start.attitude: must keep every constraint",
     ),
     "another kind": (
         'kind = "keep_out"',
         'kind = "avoid"',
-        "constraints.0.kind: Input should be 'keep_out' (got 'avoid')",
+        "constraints.0.kind: Input should be 'keep_out' or 'keep_in' (got 'avoid')",
     ),
     "moving cone": (
         "half_angle_deg = 20",
-        "half_angle_deg = 20\nrotation_deg = [0, 0, 0.1]",
-        "constraints.0.rotation_deg: not supported yet; allowed is [0, 0, 0]",
+        "half_angle_deg = 20\nrotation_deg = [0, 0, inf]",
+        "constraints.0.rotation_deg.2: Input should be a finite number (got inf)",
     ),
     "delay": (
         "[start]",
@@ -264,24 +303,23 @@ REFUSED = {
     "start inside": (
         DIRECTION,
         "direction = [0, 0.1736, 0.9848]",
-        "start.attitude: must keep every instrument outside its cones; (1, 0, 0, 0) has 'telescope' 10 deg inside"
-        " constraints.0, of half angle 20 deg",
+        "start.attitude: must keep every constraint; (1, 0, 0, 0) has 'telescope' 10 deg inside constraints.0, a"
+        " keep_out cone of half angle 20 deg",
     ),
     "target inside": (
         DIRECTION,
         "direction = [1, 0, 0]",
-        "target.attitude: must keep every instrument outside its cones; (0.5, 0.5, 0.5, 0.5) has 'telescope' 20 deg"
-        " inside constraints.0",
+        "target.attitude: must keep every constraint; (0.5, 0.5, 0.5, 0.5) has 'telescope' 20 deg inside constraints.0",
     ),
     "target by direction inside": (
         TARGET,
         'instrument = "telescope"\ndirection = [0, 1, 0]',
-        "target.direction: no roll about it keeps every instrument 0.25 deg outside its cones; the best leaves -20 deg",
+        "target.direction: no roll about it keeps every constraint by 0.25 deg; the best leaves -20 deg",
     ),
     "g cm2": (
         "[[0.05, 0, 0], [0, 0.06, 0], [0, 0, 0.02]]",
         "[[5e5, 0, 0], [0, 6e5, 0], [0, 0, 2e5]]",
-        "spacecraft: inertia: moments of up to 600000 kg m2 on a torque_limit of 0.004 N m make a half turn take 12.1"
+        "spacecraft: inertia: moments of up to 600000 kg m2 on a torque of 0.004 N m make a half turn take 12.1"
         " h; allowed is at most 1 h",
     ),
     "torque in mN m": (

@@ -48,7 +48,7 @@ def _fly(
         def advance(step, flight):
             (at, memory), first, attitudes = flight
             action, memory = controller.decide(at, model, memory)
-            torque_B, _ = model.actuators.apply(action, None)
+            torque_B, _ = model.actuators.apply(action, None, at.body.omega_BN_B, model.inertia_B, model.dt)
             body = state.propagate(at.body, torque_B, state.nominal(model), model.dt)
             after = at.replace(body=body, steps=at.steps + 1), memory
             return after, jnp.where(step == 0, action, first), attitudes.at[step].set(body.q_BN)
@@ -158,7 +158,7 @@ def test_all_spacecraft_of_a_shape_fly_one_maneuver_in_their_own_time(controller
 
 def scaled(inertia, torque, step):
     """The paper's spacecraft with inertia and torque limit times these, and a time step in units of T."""
-    limit_B = torque * states.MODEL.actuators.limits(None).box_B
+    limit_B = torque * states.MODEL.actuators.limits(None, jnp.zeros(3)).box_B
     model = states.MODEL.replace(inertia_B=inertia * states.MODEL.inertia_B, actuators=TorqueBox(limit_B))
     return model.replace(dt=step * units.of(model).time)
 

@@ -67,7 +67,7 @@ def _safe(bodies: RigidBodyState, zones: PointingConstraint) -> jax.Array:
 def _filter_with(
     made: Shield, model: Model, bodies: RigidBodyState, torques_B: jax.Array, zones: PointingConstraint
 ) -> jax.Array:
-    limits = model.actuators.limits(None)
+    limits = model.actuators.limits(None, jnp.zeros(3))
     return jax.vmap(lambda body, torque_B, zone: made.filter(body, torque_B, zone, limits, model))(
         bodies, torques_B, zones
     )

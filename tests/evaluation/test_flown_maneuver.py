@@ -106,6 +106,26 @@ def test_margins_are_of_each_constraint_in_the_order_of_the_file():
     np.testing.assert_allclose(found.min(), np.rad2deg(flown.result.min_margin), atol=1e-3)
 
 
+@pytest.mark.slow
+def test_margins_of_cones_that_turn_and_of_cones_to_be_kept_in_are_those_of_their_time():
+    moving = changed(
+        "calaon2",
+        duration_seconds=2.0,
+        published=None,
+        constraints=[
+            {"instrument": "camera", "direction": (-1, 0, 0), "half_angle_deg": 20.0, "rotation_deg": (0.0, 3.0, 0.0)},
+            {"instrument": "camera", "kind": "keep_in", "direction": (1, 0, 0), "half_angle_deg": 170.0},
+        ],
+        instruments=[{"name": "camera", "boresight": (1, 0, 0)}],
+    )
+    flown = koz_jax.fly(moving, "pd")
+    attitudes = np.asarray(flown.history.state.body.q_BN, np.float64)
+    at_steps = [moving.margins_deg(q, moving.step_seconds * i) for i, q in enumerate(attitudes)]
+    found = np.array(flown.report()["margins_deg"])
+    assert np.all(found <= np.min(at_steps, axis=0) + 1e-3)
+    np.testing.assert_allclose(found, np.min(at_steps, axis=0), atol=0.5)
+
+
 def test_the_largest_rate_is_that_of_the_history():
     rates = np.linalg.norm(np.rad2deg(short().history.state.body.omega_BN_B), axis=1)
     np.testing.assert_allclose(short().report()["peak_rate_deg"], rates.max(), rtol=1e-3)
@@ -213,7 +233,7 @@ def test_what_was_chosen_and_what_is_published_is_told():
     assert row.split()[-2:] == ["-", "207"] and text.endswith("published: PD + CBF")
     assert "flown for" not in text and text.count("camera") == 3
     free = maneuver.describe(SHORT.model_copy(update={"duration_seconds": None}), short())
-    assert "pictures show where camera looks, not tracker" in free and "pictures" not in text
+    assert "pictures show where camera looks and its cones, not tracker" in free and "pictures" not in text
     assert "flown for 120 s: 5 times the fastest half turn, 22.9 s" in free and "published" not in free
 
 

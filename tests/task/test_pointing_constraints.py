@@ -138,3 +138,41 @@ def test_an_absent_zone_leaves_the_others_in_force():
         )
         np.testing.assert_array_equal(beside.is_present, [True, False])
         np.testing.assert_allclose(smallest_margin(UPRIGHT, alone), smallest_margin(UPRIGHT, beside), atol=1e-6)
+
+
+def test_to_be_kept_in_a_cone_leaves_what_is_missing_to_its_edge():
+    for q, look, axis in zip(_attitudes(30, 20), _directions(30, 21), _directions(30, 22), strict=True):
+        kept = pointing_constraints.keep_in(jnp.array(look), jnp.array(axis), jnp.float32(0.7))
+        angle = angle_to_axis(q, _cone(look, axis, 0.7))
+        np.testing.assert_allclose(margin(q, kept), 0.7 - angle, atol=2e-6)
+
+
+def _turning(count: int) -> PointingConstraint:
+    rates = jnp.array(0.3 * _directions(count, 31)).at[0].set(0.0)
+    return _stack(_directions(1)[0], _directions(count, 30), np.full(count, 0.3)).replace(axis_rate_N=rates)
+
+
+def test_axes_turn_as_the_oracle_turns_them():
+    zones = _turning(6)
+    later = pointing_constraints.later(zones, 7.0)
+    turned = oracle.Rotation.from_rotvec(7.0 * np.asarray(zones.axis_rate_N, np.float64)).apply(zones.axis_N)
+    np.testing.assert_allclose(later.axis_N, turned, atol=2e-6)
+    np.testing.assert_array_equal(later.axis_N[0], zones.axis_N[0])
+    np.testing.assert_array_equal(later.half_angle, zones.half_angle)
+
+
+def test_axes_turn_in_parts_as_they_do_at_once():
+    zones = _turning(6)
+    parts = pointing_constraints.later(pointing_constraints.later(zones, 2.5), 4.5)
+    np.testing.assert_allclose(parts.axis_N, pointing_constraints.later(zones, 7.0).axis_N, atol=2e-6)
+
+
+def test_where_no_axis_turns_nothing_does():
+    zones = _stack(_directions(1)[0], _directions(3), np.full(3, 0.3))
+    assert pointing_constraints.later(zones, 7.0) is zones
+
+
+def test_a_stack_of_turning_axes_is_filled_up_with_one_that_is_absent():
+    filled = pointing_constraints.filled_up(_turning(2), 4)
+    np.testing.assert_array_equal(filled.is_present, [True, True, False, False])
+    assert filled.axis_rate_N is not None and filled.axis_rate_N.shape == (4, 3)

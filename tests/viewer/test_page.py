@@ -206,7 +206,7 @@ def test_any_number_of_zones(agents, half_angles_deg):
         places = np.array([trace[axis] for axis in "xyz"]).T
         np.testing.assert_allclose(np.argmax(places, axis=1), [0, 1])
         np.testing.assert_allclose(places.max(axis=1), np.cos(np.deg2rad(half_angles_deg)), atol=1e-4)
-        assert "zone 1 of 20.0° half angle, zone 2 of 35.0° half angle" in text
+        assert "zone 1, half angle 20.0°, zone 2, half angle 35.0°" in text
 
 
 def maneuver_of(seconds, step, settling_time):

@@ -98,40 +98,46 @@ class ManeuverConfig(Table):
 
     @model_validator(mode="after")
     def _clear_at_both_ends(self) -> Self:
-        self._check_clear("start.attitude", self.start.attitude)
-        self._check_clear("target.attitude" if self.target.attitude else "target.direction", self.aim.attitude)
+        self._check_clear("start.attitude", self.start.attitude, 0.0)
+        where = "target.attitude" if self.target.attitude else "target.direction"
+        self._check_clear(where, self.aim.attitude, self.seconds)
         return self
 
-    def _check_clear(self, where: str, attitude: tuple[float, ...]) -> None:
-        margins = self.margins_deg(np.array(attitude))
+    def _check_clear(self, where: str, attitude: tuple[float, ...], seconds: float) -> None:
+        """Refuse an attitude that breaks a constraint at a time after the start."""
+        margins = self.margins_deg(np.array(attitude), seconds)
         if len(margins) and margins.min() <= 0.0:
             number = int(margins.argmin())
             constraint = self.constraints[number]
             written = ", ".join(f"{value:.6g}" for value in attitude)
+            when = f" after {seconds:g} s" if any(constraint.rotation_deg) and seconds else ""
             raise ValueError(
-                f"{where}: must keep every instrument outside its cones; ({written}) has {constraint.instrument!r}"
-                f" {-margins.min():.3g} deg inside constraints.{number}, of half angle"
-                f" {constraint.half_angle_deg:g} deg"
+                f"{where}: must keep every constraint; ({written}) has {constraint.instrument!r}"
+                f" {-margins.min():.3g} deg {constraint.forbidden_side} constraints.{number}{when}, a"
+                f" {constraint.kind} cone of half angle {constraint.half_angle_deg:g} deg"
             )
 
     def boresight(self, instrument: str) -> np.ndarray:
         """Where an instrument looks.  Returns (3,) unit vector in body axes."""
         return np.array(next(found.boresight for found in self.instruments if found.name == instrument))
 
-    def margins_deg(self, attitude: np.ndarray) -> np.ndarray:
-        """Margin to each constraint.  attitude: (..., 4).  Returns (..., constraints) [deg]."""
+    def margins_deg(self, attitude: np.ndarray, seconds: float = 0.0) -> np.ndarray:
+        """Margin to each constraint, a time [s] after the start.
+
+        attitude: (..., 4).  Returns (..., constraints) [deg].
+        """
         if not self.constraints:
             return np.zeros((*attitude.shape[:-1], 0))
         cones = [one.keep_out_cone for one in self.constraints]
         looks = [attitudes.rotate(attitude, self.boresight(one.instrument)) for one in self.constraints]
         angles = [
-            attitudes.angle_between(look, np.array(cone.direction)) for look, cone in zip(looks, cones, strict=True)
+            attitudes.angle_between(look, cone.axis_after(seconds)) for look, cone in zip(looks, cones, strict=True)
         ]
         return np.rad2deg(np.stack(angles, axis=-1)) - [cone.half_angle_deg for cone in cones]
 
     @property
     def aim(self) -> Aim:
-        """The target attitude.
+        """The target attitude, which must keep every constraint when the maneuver ends.
 
         For a target by direction the one that the smallest rotation from the start leads to; if that ends inside a
         constraint, the nearest roll about the direction that does not.
@@ -143,18 +149,18 @@ class ManeuverConfig(Table):
         direction = np.array(self.target.direction)
         looks = attitudes.rotate(start, self.boresight(self.target.instrument))
         straight = attitudes.multiply(attitudes.shortest_arc(looks, direction), start)
-        if np.all(self.margins_deg(straight) > 0.0):
+        if np.all(self.margins_deg(straight, self.seconds) > 0.0):
             return _nearer(straight, start, 0.0)
         count = round(180.0 / _ROLL_STEP_DEG)
         rolls_deg = _ROLL_STEP_DEG * np.arange(1, count + 1)
         rolls_deg = np.stack([rolls_deg, -rolls_deg], axis=1).ravel()
         rolled = attitudes.multiply(attitudes.turn_about(direction, np.deg2rad(rolls_deg)), straight)
-        clear = self.margins_deg(rolled).min(axis=1)
+        clear = self.margins_deg(rolled, self.seconds).min(axis=1)
         found = int(np.argmax(clear >= _ROLL_CLEARANCE_DEG)) if clear.max() >= _ROLL_CLEARANCE_DEG else None
         if found is None:
             raise ValueError(
-                f"target.direction: no roll about it keeps every instrument {_ROLL_CLEARANCE_DEG:g} deg outside its"
-                f" cones; the best leaves {clear.max():.3g} deg, got {self.target.direction}"
+                f"target.direction: no roll about it keeps every constraint by {_ROLL_CLEARANCE_DEG:g} deg;"
+                f" the best leaves {clear.max():.3g} deg, got {self.target.direction}"
             )
         return _nearer(rolled[found], start, float(rolls_deg[found]))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, ValidationError, model_validator
+from pydantic import AfterValidator, ValidationError, model_validator
 
 from koz_jax.config import attitudes
 from koz_jax.config.base import (
@@ -18,6 +18,7 @@ from koz_jax.config.base import (
 )
 from koz_jax.config.task import SpacecraftConfig, TorqueLimit
 from koz_jax.config.uncertainty import DelaySteps, UncertaintyConfig
+from koz_jax.config.wheels import WheelConfig
 from koz_jax.errors import explain
 
 # By so much a direction or a quaternion may be longer or shorter than 1; more is a slip of the pen.
@@ -33,32 +34,6 @@ def _of_unit_length(values: tuple[float, ...]) -> tuple[float, ...]:
         kind = "a unit quaternion, scalar first" if len(values) == 4 else "a unit vector"
         raise ValueError(f"must be {kind}, of length 1 to within {_LENGTH_TOLERANCE:.0%}; its length is {length:.6g}")
     return tuple(attitudes.normalized(values).tolist())
-
-
-def _not_yet(allowed: str) -> BeforeValidator:
-    """Refuse what the format has and this version cannot fly."""
-
-    def refuse(value: Any) -> Any:
-        if value is not None:
-            raise ValueError(f"not supported yet; {allowed}")
-        return value
-
-    return BeforeValidator(refuse)
-
-
-def _only_zero(allowed: str) -> AfterValidator:
-    def refuse(value: Any) -> Any:
-        if np.any(np.asarray(value) != 0):
-            raise ValueError(f"not supported yet; {allowed}")
-        return value
-
-    return AfterValidator(refuse)
-
-
-def _keep_out_only(kind: Any) -> Any:
-    if kind == "keep_in":
-        raise ValueError("not supported yet; allowed is 'keep_out'")
-    return kind
 
 
 Direction = Annotated[Vector, AfterValidator(_of_unit_length)]
@@ -78,20 +53,36 @@ class Table(Settings):
         return given
 
 
+class WheelTable(Table):
+    """A reaction wheel."""
+
+    axis: Direction
+    """Its axis, in body axes; normalised on reading."""
+    max_torque: PositiveFloat
+    """Largest torque of its motor [N m]."""
+    max_momentum: PositiveFloat
+    """Largest angular momentum that it holds [N m s]."""
+    momentum: float = 0.0
+    """Angular momentum at the start [N m s]."""
+
+
 class BodyConfig(Table):
     """The spacecraft's body and actuators."""
 
     inertia: tuple[Vector, Vector, Vector]
     """Inertia tensor in body axes, row by row [kg m^2]."""
-    torque_limit: TorqueLimit
-    """Largest torque about each body axis [N m]: one number for all, or one for each."""
-    wheels: Annotated[None, _not_yet("allowed is torque_limit [N m], one number or three")] = None
-    """Reaction wheels: not supported yet."""
+    torque_limit: TorqueLimit | None = None
+    """Largest torque about each body axis [N m]: one number for all, or one for each; either this or wheels."""
+    wheels: tuple[WheelTable, ...] = ()
+    """Reaction wheels, at least three, with axes that do not lie in a plane."""
     max_rate_deg: PositiveFloat | None = None
     """Largest norm of the body rate [deg/s]; kept by agents for any spacecraft."""
 
     @model_validator(mode="after")
     def _physical(self) -> Self:
+        if (self.torque_limit is None) != bool(self.wheels):
+            given = "both" if self.wheels else "neither"
+            raise ValueError(f"torque_limit: must be given where there are no wheels, and only there; got {given}")
         try:
             self.spacecraft((1.0, 0.0, 0.0))
         except ValidationError as error:
@@ -99,7 +90,7 @@ class BodyConfig(Table):
         slowest = self.half_turns[0]
         if slowest > _LONGEST_HALF_TURN_SECONDS:
             raise ValueError(
-                f"inertia: moments of up to {np.max(np.diag(self.inertia)):.6g} kg m2 on a torque_limit of"
+                f"inertia: moments of up to {np.max(np.diag(self.inertia)):.6g} kg m2 on a torque of"
                 f" {min(self.spacecraft((1.0, 0.0, 0.0)).torque_limits):.6g} N m make a half turn take"
                 f" {slowest / 3600.0:.3g} h; allowed is at most 1 h. Are the moments in g cm2 or kg mm2?"
             )
@@ -107,11 +98,13 @@ class BodyConfig(Table):
 
     def spacecraft(self, boresight: Vector) -> SpacecraftConfig:
         """The same with an instrument.  boresight: unit vector in body axes."""
+        limit = {} if self.torque_limit is None else {"torque_limit": self.torque_limit}
         return SpacecraftConfig(
             inertia=self.inertia,
             boresight=boresight,
-            torque_limit=self.torque_limit,
+            wheels=tuple(WheelConfig(**wheel.model_dump()) for wheel in self.wheels),
             max_rate_deg=self.max_rate_deg,
+            **limit,
         )
 
     @property
@@ -134,28 +127,50 @@ class InstrumentConfig(Table):
 class Cone(NamedTuple):
     """Directions that an instrument is kept out of."""
 
-    direction: Vector  # axis, in inertial axes
+    direction: Vector  # axis at the start, in inertial axes
     half_angle_deg: float
+    rotation_deg: Vector  # [deg/s] angular velocity of the axis, in inertial axes
+
+    def axis_after(self, seconds: float) -> np.ndarray:
+        """Where the axis is a time [s] after the start.  Returns (3,) unit vector."""
+        rate = np.deg2rad(self.rotation_deg)
+        speed = float(np.linalg.norm(rate))
+        if speed == 0.0:
+            return np.array(self.direction)
+        return attitudes.rotate(attitudes.turn_about(rate / speed, speed * seconds), np.array(self.direction))
 
 
 class ConstraintConfig(Table):
-    """A cone of directions that an instrument must not look into."""
+    """A cone of directions that an instrument must not look into, or must not leave."""
 
     instrument: str
     """Its name."""
-    kind: Annotated[Literal["keep_out"], BeforeValidator(_keep_out_only)] = "keep_out"
-    """The instrument is kept out of the cone; keep_in is not supported yet."""
+    kind: Literal["keep_out", "keep_in"] = "keep_out"
+    """The instrument is kept out of the cone, or in it."""
     direction: Direction
-    """Axis of the cone, in inertial axes; normalised on reading."""
+    """Axis of the cone at the start, in inertial axes; normalised on reading."""
     half_angle_deg: HalfAngleDeg
     """Half angle of the cone [deg]."""
-    rotation_deg: Annotated[Vector, _only_zero("allowed is [0, 0, 0]: directions are fixed")] = (0.0, 0.0, 0.0)
-    """Angular velocity of the direction [deg/s]: not supported yet unless zero."""
+    rotation_deg: Vector = (0.0, 0.0, 0.0)
+    """Angular velocity of the direction [deg/s], in inertial axes; of the Earth seen from a low orbit it is 0.064."""
 
     @property
     def keep_out_cone(self) -> Cone:
-        """What the instrument is kept out of, whatever the kind."""
-        return Cone(self.direction, self.half_angle_deg)
+        """What the instrument is kept out of: to be kept in a cone is to be kept out of the rest of the sphere."""
+        if self.kind == "keep_out":
+            return Cone(self.direction, self.half_angle_deg, self.rotation_deg)
+        x, y, z = self.direction
+        return Cone((-x, -y, -z), 180.0 - self.half_angle_deg, self.rotation_deg)
+
+    @property
+    def allowed_side(self) -> str:
+        """Where the instrument may look, seen from the cone."""
+        return "outside" if self.kind == "keep_out" else "inside"
+
+    @property
+    def forbidden_side(self) -> str:
+        """Where it may not look."""
+        return "inside" if self.kind == "keep_out" else "outside"
 
 
 class StartConfig(Table):

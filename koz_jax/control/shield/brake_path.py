@@ -14,6 +14,9 @@ from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.pointing_constraints import PointingConstraint
 from koz_jax.task.state import Model
 
+# Steps in which a slow craft comes to rest, whatever it is asked for, with the one that is decided on.
+SOON_STEPS = 6.0
+
 
 class Brake(struct.PyTreeNode):
     """A brake, and bounds on what it does not know; traced but for the number of samples."""
@@ -22,6 +25,7 @@ class Brake(struct.PyTreeNode):
     inertia_error: jax.Array  # () largest relative error of the inertia
     disturbance: jax.Array  # () [N m] largest torque from outside
     rate_error: jax.Array  # () [rad/s] largest error of a measured rate
+    cone_rate: jax.Array  # () [rad/s] largest rate of a cone's axis
     smallest_moment: jax.Array  # () [kg m^2] of inertia, a
     largest_moment: jax.Array  # () [kg m^2] c
     samples: int = struct.field(pytree_node=False)  # of a brake path
@@ -50,6 +54,8 @@ class _Tolerance(struct.PyTreeNode):
     gyroscopic: jax.Array  # () [rad] at its end, of a wrong inertia's gyroscopic torque
     drift: jax.Array  # () [rad/s] per second of free motion
     integration: jax.Array  # () [rad]
+    soon: jax.Array  # () [rad] that cones turn in some steps, which is the same whoever decides
+    swept: jax.Array  # () [rad] that they turn in the rest of the brake's time
 
     def after(self, share: jax.Array, seconds: jax.Array) -> jax.Array:
         """Tolerance [rad] after a share () of the path, that is after so many seconds () of free motion."""
@@ -59,6 +65,8 @@ class _Tolerance(struct.PyTreeNode):
             + self.gyroscopic * (2.0 * time**2 - time**4)
             + self.drift * seconds
             + self.integration
+            + self.soon
+            + self.swept * time
         )
 
 
@@ -173,7 +181,7 @@ def step_clearance(
         return jax.vmap(rotations.dot)(at.constraints.axis_N, looks_N)
 
     highest = jnp.maximum(cosines(before), cosines(after)) + bend * model.dt**2 / 8.0
-    return _margin(highest, at.constraints)
+    return _margin(highest, at.constraints) - brake.cone_rate * model.dt
 
 
 def _speed_per_momentum(boresight_B: jax.Array, inverse_B: jax.Array) -> jax.Array:
@@ -229,6 +237,8 @@ def _tolerance(brake: Brake, motion: _Motion, length: jax.Array, pushed: jax.Arr
         gyroscopic=gyroscopic * arc**2,
         drift=2.0 * (brake.rate_error + pushed),
         integration=brake.samples * (motion.rate * length / brake.samples) ** 5 / 120.0,
+        soon=brake.cone_rate * SOON_STEPS * dt,
+        swept=brake.cone_rate * jnp.maximum(motion.momentum / brake.torque - (SOON_STEPS - 2.0) * dt, 0.0),
     )
 
 

@@ -22,7 +22,7 @@ from koz_jax.task.actuators import TorqueLimits
 from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.environment import Reorientation
 from koz_jax.task.pointing_constraints import PointingConstraint
-from koz_jax.task.state import EnvState, Model, torque_limits
+from koz_jax.task.state import EnvState, Model, nominal_limits, torque_limits
 from koz_jax.task.uncertainty import NOISE_BOUND
 
 # Shares of the request in a mix with the guide, and of the guide in a mix with the brake, that are tried in this order.
@@ -49,16 +49,29 @@ class Shield(struct.PyTreeNode):
     rate_limit: RateLimit | None = None  # None where the spacecraft has none
 
     def covers(self, state: EnvState, model: Model) -> jax.Array:
-        """Whether the guarantee holds from this state on: braking keeps the margin.  Returns () bool."""
-        return is_safe(self, state.body, state.scenario.constraints, model)
+        """Whether the guarantee holds from this state on: braking keeps the margin.  Returns () bool.
+
+        Braking itself is possible for actuators that store momentum only below their largest rate.
+        """
+        safe = is_safe(self, state.body, state.scenario.constraints, model)
+        if model.actuators.stored_momentum(state.actuators) is None:
+            return safe
+        limit = self._limit_now(state, model)
+        return safe & (True if limit is None else limit.squared_peak(state.body) <= limit.squared)
 
     def allow(self, measured: EnvState, action: jax.Array, model: Model) -> jax.Array:
         """Action (3,) in [-1, 1] that is let through in place of the requested one (3,) in [-1, 1]."""
         limits = torque_limits(measured, model)
         torque_B = limits.box_B * action
-        allowed_B = self.filter(measured.body, torque_B, measured.scenario.constraints, limits, model)
+        now = self.replace(rate_limit=self._limit_now(measured, model))
+        allowed_B = now.filter(measured.body, torque_B, measured.scenario.constraints, limits, model)
         # What passes comes back to the last bit, also where the limit is no power of two.
         return jnp.where(jnp.all(allowed_B == torque_B), action, allowed_B / limits.box_B)
+
+    def _limit_now(self, measured: EnvState, model: Model) -> RateLimit | None:
+        if self.rate_limit is None or model.actuators.stored_momentum(measured.actuators) is None:
+            return self.rate_limit
+        return rate_limit.now(self.rate_limit, self.brake.rate_error, measured, model)
 
     def filter(
         self,
@@ -93,8 +106,9 @@ class Shield(struct.PyTreeNode):
             inside = brake_path.step_clearance(self.brake, body, after, candidate_B, situation, model)
             # Of a slow state the clearance is known well, so what is no worse than braking will do where there is less
             # than there should be; of a fast one it is a bound that may have been better before.  Inside a zone any way
-            # out is good.
-            present = jnp.where(slow | inside_now, search.braking, jnp.inf)
+            # out is good, and so is the way straight away from a cone that comes.
+            flees = (number == _AWAY) & (self.brake.cone_rate > 0.0)
+            present = jnp.where(slow | inside_now | flees, search.braking, jnp.inf)
             least = self._least(number, present)
             pushed = brake_path.push_error(self.brake, candidate_B, model.dt)
             needed = jnp.where(number == _BRAKE, -jnp.inf, least)
@@ -131,7 +145,7 @@ class _Search(struct.PyTreeNode):
 def from_config(config: ShieldConfig, model: Model) -> Shield:
     """Make a shield for a spacecraft, with a margin for the errors that ``config`` has to withstand."""
     errors = config.error_bounds
-    limits = model.actuators.limits(model.actuators.initial_state())
+    limits = nominal_limits(model)
     attitude_error, rate_error = (
         jnp.deg2rad(jnp.float32(NOISE_BOUND * np.sqrt(3.0) * deviation + bias))
         for deviation, bias in (
@@ -141,19 +155,21 @@ def from_config(config: ShieldConfig, model: Model) -> Shield:
     )
     moments = jnp.linalg.eigvalsh(model.inertia_B)
     brake = Brake(
-        torque=limits.every_direction - errors.disturbance_torque,
+        torque=model.actuators.brake_torque - errors.disturbance_torque,
         inertia_error=jnp.float32(errors.inertia_error),
         disturbance=jnp.float32(errors.disturbance_torque),
         rate_error=rate_error,
+        cone_rate=jnp.deg2rad(jnp.float32(config.cone_rate_deg)),
         smallest_moment=moments[0],
         largest_moment=moments[2],
         samples=config.samples,
     )
+    made = guide.from_config(config, brake, limits, model)
     return Shield(
-        margin=jnp.deg2rad(jnp.float32(config.margin_deg)) + 2.0 * attitude_error,
+        margin=jnp.deg2rad(jnp.float32(config.margin_deg)) + 2.0 * attitude_error + guide.lead(made, brake, model.dt),
         attitude_error=attitude_error,
         brake=brake,
-        guide=guide.from_config(config, brake, limits, model),
+        guide=made,
         rate_limit=rate_limit.from_model(model, rate_error),
     )
 

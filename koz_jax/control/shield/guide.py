@@ -5,12 +5,12 @@ import jax.numpy as jnp
 from flax import struct
 
 from koz_jax.config.shield import ShieldConfig
-from koz_jax.control.shield.brake_path import Brake
+from koz_jax.control.shield.brake_path import SOON_STEPS, Brake
 from koz_jax.task import dynamics, pointing_constraints, rotations
 from koz_jax.task.actuators import TorqueLimits
 from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.pointing_constraints import PointingConstraint
-from koz_jax.task.state import Model
+from koz_jax.task.state import Model, nominal_rate
 
 # In units of T = sqrt(J / u), J a third of the trace of the inertia, u the strength of the actuators.
 _SECONDS_T = 0.09
@@ -40,8 +40,9 @@ def from_config(config: ShieldConfig, brake: Brake, limits: TorqueLimits, model:
     unit = jnp.sqrt(jnp.trace(model.inertia_B) / (3.0 * limits.scale))
     wanted = _RATE_T / unit if config.guide_rate_deg is None else jnp.deg2rad(jnp.float32(config.guide_rate_deg))
     rate = jnp.minimum(wanted, _ARC / model.dt)
-    if model.max_rate is not None:
-        rate = jnp.minimum(rate, _RATE_SHARE * model.max_rate)
+    largest = nominal_rate(model)
+    if largest is not None:
+        rate = jnp.minimum(rate, _RATE_SHARE * largest)
     e = brake.inertia_error
     return Guide(
         rate=rate,
@@ -49,6 +50,15 @@ def from_config(config: ShieldConfig, brake: Brake, limits: TorqueLimits, model:
         # A brake path that may be wrong by this share of its length then still leads away.
         tilt=e / (1.0 - e) + brake.disturbance / brake.torque + (rate * model.dt) ** 2,
     )
+
+
+def lead(guide: Guide, brake: Brake, dt: jax.Array) -> jax.Array:
+    """Margin that it takes to lead away from a cone as fast as that comes.  Returns () [rad].
+
+    The rate that leads away grows with what is missing to twice the margin: at half of it, 1.5 margins in AHEAD times
+    the guide's seconds.  Twice what the cone turns in those seconds is above that, and above what it turns meanwhile.
+    """
+    return (2.0 * AHEAD * guide.seconds + SOON_STEPS * dt) * brake.cone_rate
 
 
 def torques(

@@ -1,7 +1,7 @@
 """The shield's rate limit: no torque that could ever lead to a rate above it, coasting and braking included.
 
 The squared largest rate of torque-free motion is a quadratic form of the rate, which that motion keeps constant (see
-``dynamics.peak_rate_form``).A brake against the momentum follows the path of torque-free motion with a rate
+``dynamics.peak_rate_form``).  A brake against the momentum follows the path of torque-free motion with a rate
 that falls, so it keeps a bound on that form too.
 """
 
@@ -11,7 +11,7 @@ from flax import struct
 
 from koz_jax.task import dynamics, rotations
 from koz_jax.task.dynamics import RigidBodyState
-from koz_jax.task.state import Model
+from koz_jax.task.state import EnvState, Model, largest_rate, nominal_rate
 
 # What rounding may add to a squared rate that stays as it is.
 ROUNDING = 1e-5
@@ -53,10 +53,24 @@ class RateLimit(struct.PyTreeNode):
 
 
 def from_model(model: Model, rate_error: jax.Array) -> RateLimit | None:
-    """The limit of a spacecraft, tighter by the largest error of a measured rate () [rad/s]; None where it has none."""
-    if model.max_rate is None:
+    """The limit of a spacecraft at the start, at rest; None where it has none.
+
+    rate_error: () [rad/s] largest error of a measured rate, by which the limit is tighter.
+    """
+    largest = nominal_rate(model)
+    if largest is None:
         return None
-    return RateLimit(dynamics.peak_rate_form(model.inertia_B), jnp.maximum(model.max_rate - rate_error, 0.0) ** 2)
+    return RateLimit(dynamics.peak_rate_form(model.inertia_B), _squared(largest, rate_error))
+
+
+def now(limit: RateLimit, rate_error: jax.Array, measured: EnvState, model: Model) -> RateLimit:
+    """The limit in a state: that of actuators depends on the momentum that is on board."""
+    largest = largest_rate(measured, model)
+    return limit if largest is None else limit.replace(squared=_squared(largest, rate_error))
+
+
+def _squared(largest: jax.Array, rate_error: jax.Array) -> jax.Array:
+    return jnp.maximum(largest - rate_error, 0.0) ** 2
 
 
 def _positive(x: jax.Array) -> jax.Array:

@@ -13,7 +13,10 @@ from koz_jax.task.any_spacecraft import units
 from koz_jax.task.any_spacecraft.units import Units
 from koz_jax.task.observation_layout import FREE_RATE, FULL_ACTION, SHORTEST_STEP, layout, zone_part
 from koz_jax.task.pointing_constraints import PointingConstraint
-from koz_jax.task.state import EnvState, Model, attitude_error, torque_limits
+from koz_jax.task.state import EnvState, Model, attitude_error, largest_rate, torque_limits
+
+# Of the rate from which there is no limit, what a policy tells apart from no rate at all.
+_LEAST_RATE = 1e-3
 
 
 def observe(state: EnvState, model: Model, urgency: jax.Array | float, zones: int = 1) -> jax.Array:
@@ -32,7 +35,7 @@ def observe(state: EnvState, model: Model, urgency: jax.Array | float, zones: in
         "inertia": _entries(axes @ model.inertia_B @ axes.T) / own.inertia,
         "reach": _reach(axes, torque_limits(state, model).box_B) / own.torque,
         "step": jnp.log(jnp.maximum(model.dt / (own.time * SHORTEST_STEP), 1.0))[None],
-        "rate_limit": _rate_limit(model, own)[None],
+        "rate_limit": _rate_limit(largest_rate(state, model), own)[None],
         "urgency": jnp.full(1, 2.0 * urgency - 1.0),
     }
     for number in range(zones):
@@ -48,11 +51,11 @@ def command(action: jax.Array, state: EnvState, model: Model) -> jax.Array:
     return torque_B / torque_limits(state, model).box_B
 
 
-def _rate_limit(model: Model, own: Units) -> jax.Array:
-    """Log of the rate limit over that from which it is none.  Returns (), 0 where there is none."""
-    if model.max_rate is None:
+def _rate_limit(largest: jax.Array | None, own: Units) -> jax.Array:
+    """Log of the rate limit () [rad/s] over that from which it is none.  Returns (), 0 where there is none."""
+    if largest is None:
         return jnp.zeros(())
-    return jnp.log(jnp.minimum(model.max_rate * own.time / FREE_RATE, 1.0))
+    return jnp.log(jnp.clip(largest * own.time / FREE_RATE, _LEAST_RATE, 1.0))
 
 
 def _entries(tensor: jax.Array) -> jax.Array:

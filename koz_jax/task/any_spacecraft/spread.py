@@ -1,14 +1,19 @@
 """What is drawn anew for every maneuver besides its scenario: spacecraft, rate limit, urgency, delay."""
 
+from typing import Literal
+
 import jax
 import jax.numpy as jnp
 from flax import struct
 
+from koz_jax.config import wheels
 from koz_jax.config.spread import SpreadConfig
 from koz_jax.config.task import TaskConfig
+from koz_jax.config.wheels import WheelConfig
 from koz_jax.task import rotations
-from koz_jax.task.actuators import TorqueBox
+from koz_jax.task.actuators import Actuators, ReactionWheels, TorqueBox
 from koz_jax.task.any_spacecraft import units
+from koz_jax.task.any_spacecraft.units import Units
 from koz_jax.task.state import Model
 
 # Smallest second moment of a body of unit largest one: no body is thinner.
@@ -23,6 +28,16 @@ _DELAY = 0x44454C
 # Share of the maneuvers at either end of the urgencies, beyond which an agent learns nothing.
 _AT_AN_END = 1.0 / 7.0
 
+# Axes of the wheels that are drawn, in body axes; those of the pyramid are at 54.7 deg from z.
+_SIDE = 3.0**-0.5
+_WHEEL_AXES = {
+    "three": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    "pyramid": ((_SIDE, _SIDE, _SIDE), (-_SIDE, _SIDE, _SIDE), (-_SIDE, -_SIDE, _SIDE), (_SIDE, -_SIDE, _SIDE)),
+}
+
+# Of what a wheel holds, the most that it holds at the start.
+_BIAS = 0.3
+
 # Torque limits of the axes differ by at most this factor.
 _UNEQUAL = 2.0
 
@@ -35,10 +50,12 @@ class Spread(struct.PyTreeNode):
     urgencies: jax.Array  # (2,)
     delays: jax.Array  # (2,) int32
     slenderness: jax.Array  # (2,) smallest over largest second moment
+    wheel_momentum: jax.Array  # (2,) [u T]
     spacecraft: bool = struct.field(pytree_node=False)
     rate_limits: bool = struct.field(pytree_node=False)
     late: bool = struct.field(pytree_node=False)
     slender: bool = struct.field(pytree_node=False)
+    wheels: Literal["three", "pyramid"] | None = struct.field(pytree_node=False)
 
 
 class Drawn(struct.PyTreeNode):
@@ -85,11 +102,34 @@ def _sample_body(spread: Spread, model: Model, key: jax.Array) -> Model:
     moments = 1.5 * own.inertia * (1.0 - second / jnp.sum(second))
     turn = rotations.normalize(jax.random.normal(key_turn, (4,)))
     axes = jax.vmap(rotations.rotate, in_axes=(None, 0))(turn, jnp.eye(3))
-    limits = _UNEQUAL ** jax.random.uniform(key_torque, (3,), minval=-0.5, maxval=0.5)
-    limits = own.torque * limits / jnp.sqrt(jnp.mean(limits**2))
     low, high = spread.step_shares
     share = jax.random.uniform(key_step, (), minval=low, maxval=high)
-    return model.replace(inertia_B=axes.T @ (moments[:, None] * axes), actuators=TorqueBox(limits), dt=share * own.time)
+    return model.replace(
+        inertia_B=axes.T @ (moments[:, None] * axes),
+        actuators=_sample_actuators(spread, own, key_torque),
+        dt=share * own.time,
+    )
+
+
+def _sample_actuators(spread: Spread, own: Units, key: jax.Array) -> Actuators:
+    """Draw actuators of the strength of a spacecraft's own."""
+    if spread.wheels is None:
+        limits = _UNEQUAL ** jax.random.uniform(key, (3,), minval=-0.5, maxval=0.5)
+        return TorqueBox(own.torque * limits / jnp.sqrt(jnp.mean(limits**2)))
+    key_size, key_bias = jax.random.split(key)
+    of_one = tuple(WheelConfig(axis=axis, max_torque=1.0, max_momentum=1.0) for axis in _WHEEL_AXES[spread.wheels])
+    box = jnp.array(wheels.torque_box(of_one), jnp.float32)
+    strength = jnp.full(len(of_one), own.torque / jnp.sqrt(jnp.mean(box**2)))
+    low, high = spread.wheel_momentum
+    largest = jax.random.uniform(key_size, (), minval=low, maxval=high) * own.torque * own.time
+    return ReactionWheels(
+        axes_B=jnp.array([wheel.axis for wheel in of_one], jnp.float32),
+        allocation=jnp.array(wheels.allocation(of_one), jnp.float32),
+        max_torque=strength,
+        max_momentum=jnp.full(len(of_one), largest),
+        momentum=_BIAS * largest * jax.random.uniform(key_bias, (len(of_one),), minval=-1.0, maxval=1.0),
+        box_B=strength[0] * box,
+    )
 
 
 def _second_moments(spread: Spread, key: jax.Array) -> jax.Array:
@@ -118,4 +158,6 @@ def from_config(task: TaskConfig) -> Spread | None:
         late=config.delay_steps is not None,
         slenderness=jnp.array(config.slenderness or (1.0, 1.0)),
         slender=config.slenderness is not None,
+        wheel_momentum=jnp.array(config.wheel_momentum),
+        wheels=config.wheels,
     )

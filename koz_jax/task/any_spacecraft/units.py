@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from koz_jax.task import dynamics
+from koz_jax.task import dynamics, state
 from koz_jax.task.state import Model
 
 
@@ -27,7 +27,7 @@ class Units(struct.PyTreeNode):
 
 def of(model: Model) -> Units:
     """The units of a spacecraft, by the limits that its actuators have at the start."""
-    limits = model.actuators.limits(model.actuators.initial_state())
+    limits = state.nominal_limits(model)
     inertia = jnp.trace(model.inertia_B) / 3.0
     return Units(time=jnp.sqrt(inertia / limits.scale), inertia=inertia, torque=limits.scale)
 

@@ -90,7 +90,7 @@ def test_an_action_is_an_angular_acceleration_along_the_policys_axes():
     model = spacecraft()
     at = maneuver(model, rate=0.0)
     share = nondimensional.command(jnp.array([0.1, 0.0, 0.0]), at, model)
-    torque_B = np.asarray(share * model.actuators.limits(None).box_B, np.float64)
+    torque_B = np.asarray(share * model.actuators.limits(None, jnp.zeros(3)).box_B, np.float64)
     acceleration_B = np.linalg.solve(np.asarray(model.inertia_B, np.float64), torque_B)
     expected = 0.1 * nondimensional.FULL_ACTION * float(units.of(model).acceleration)
     boresight_B = np.asarray(at.scenario.constraints.boresight_B[0])

@@ -108,3 +108,23 @@ def test_slender_bodies_are_as_slender_as_asked_for():
     shares = second.min(axis=1) / second.max(axis=1)
     assert np.all((shares > 0.0499) & (shares < 0.1001))
     assert np.ptp(shares) > 0.04
+
+
+@pytest.mark.parametrize(("wheels", "count"), [("three", 3), ("pyramid", 4)])
+def test_wheels_have_the_strength_of_the_spacecraft_and_a_bias(wheels, count):
+    task = TaskConfig(spread=SpreadConfig(spacecraft=True, wheels=wheels, wheel_momentum=(1.0, 4.0)))
+    env = Reorientation.from_config(task)
+    model = jax.jit(jax.vmap(env.drawn))(jax.random.split(jax.random.key(1), 500)).model
+    own, expected = jax.vmap(units.of)(model), units.of(model_from_config(task))
+    np.testing.assert_allclose(own.torque, expected.torque, rtol=1e-5)
+    found = model.actuators
+    assert found.axes_B.shape == (500, count, 3)
+    size = np.asarray(found.max_momentum)[:, 0] / float(expected.torque * expected.time)
+    assert 1.0 <= size.min() < 1.1 and 3.9 < size.max() <= 4.0
+    bias = np.abs(np.asarray(found.momentum) / np.asarray(found.max_momentum))
+    assert 0.29 < bias.max() <= 0.3 * (1 + 1e-5)
+
+
+def test_wheels_without_spacecraft_are_refused():
+    with pytest.raises(SettingsError, match="wheels: are drawn with spacecraft = true"):
+        checked(SpreadConfig, wheels="three")
