@@ -73,6 +73,10 @@ def trials() -> Iterator[Trial]:
         task = TaskConfig(spread=limited, episode_seconds=300.0 if limit_deg < 5.0 else 200.0)
         yield Trial(f"random, at most {limit_deg:g} deg/s", task)
         yield Trial(f"random, at most {limit_deg:g} deg/s, shield", task, shielded=True)
+    for wheels, title in (("three", "three wheels"), ("pyramid", "four wheels in a pyramid")):
+        task = TaskConfig(spread=anyone.model_copy(update={"wheels": wheels}), episode_seconds=200.0)
+        yield Trial(f"random, {title}", task)
+        yield Trial(f"random, {title}, shield", task, shielded=True)
 
 
 def cells(trial: Trial, urgency: float, results: CaseResult) -> list[str]:
