@@ -13,7 +13,7 @@ from koz_jax.cli import invocation
 from koz_jax.cli.exit_status import exit_status
 from koz_jax.cli.flags import parsing
 from koz_jax.cli.flags.flight import AGENT, URGENCY
-from koz_jax.config.base import MarginDeg, Settings
+from koz_jax.config.base import MarginDeg, NonNegativeFloat, Settings
 from koz_jax.config.maneuvers.maneuver_file import load_spacecraft
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.spread import Urgency
@@ -35,6 +35,7 @@ class _FormatFlags(Settings):
     shield: bool = False
     """Also write the shield, which keeps the boresight out of every zone; for --to c."""
     shield_margin_deg: MarginDeg = parsing.same_as(ShieldConfig, "margin_deg")
+    cone_rate_deg: NonNegativeFloat = parsing.same_as(ShieldConfig, "cone_rate_deg")
     robust: bool = False
     """Make the shield withstand errors, which the flags of errors set."""
 
@@ -51,6 +52,8 @@ class ExportFlags(UncertaintyConfig, _FormatFlags):
                 raise ValueError("robust: is of the shield, and needs --shield")
             if self.shield_margin_deg != ShieldConfig().margin_deg:
                 raise ValueError(f"shield_margin_deg: needs --shield, got {self.shield_margin_deg} without it")
+            if self.cone_rate_deg:
+                raise ValueError(f"cone_rate_deg: is of the shield and needs --shield, got {self.cone_rate_deg:g}")
         if self.robust and self._errors == CERTAIN:
             raise ValueError("robust: needs an error to withstand, such as --inertia-error 0.1")
         for name, error in self._errors.model_dump().items():
@@ -65,7 +68,11 @@ class ExportFlags(UncertaintyConfig, _FormatFlags):
     @property
     def shield_config(self) -> ShieldConfig | None:
         """The shield to export, if one is asked for."""
-        return ShieldConfig(margin_deg=self.shield_margin_deg, error_bounds=self._errors) if self.shield else None
+        if not self.shield:
+            return None
+        return ShieldConfig(
+            margin_deg=self.shield_margin_deg, cone_rate_deg=self.cone_rate_deg, error_bounds=self._errors
+        )
 
 
 def main(argv: Sequence[str]) -> int:

@@ -12,7 +12,6 @@ from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import TaskConfig
 from koz_jax.control.shield import brake_path, guide, rate_limit
 from koz_jax.control.shield import filter as shield
-from koz_jax.errors import SettingsError
 from koz_jax.export import c_network, c_observation, c_text
 from koz_jax.export.golden import EXAMPLE_CASE, Golden
 from koz_jax.export.metadata import Metadata, as_text
@@ -68,14 +67,7 @@ def c_files(policy: NumpyPolicy, metadata: Metadata, vectors: Golden, example: n
 
 
 def shield_files(metadata: Metadata, config: ShieldConfig, vectors: ShieldGolden) -> dict[str, bytes]:
-    """Header, source and self-test of a shield for the spacecraft of an exported policy, by file name.
-
-    Raises:
-        SettingsError: it is to keep out of cones that turn.
-
-    """
-    if config.cone_rate_deg:
-        raise SettingsError(f"cone_rate_deg: is not exported yet; allowed is 0, got {config.cone_rate_deg:g}")
+    """Header, source and self-test of a shield for the spacecraft of an exported policy, by file name."""
     model = environment.model_from_config(metadata.task)
     made = shield.from_config(config, model)
     replacements = {
@@ -83,6 +75,7 @@ def shield_files(metadata: Metadata, config: ShieldConfig, vectors: ShieldGolden
         "EXPORT_ID": _export_id(metadata),
         "MARGIN_DEG": f"{np.rad2deg(made.margin):.4g}",
         "MAX_RATE_DEG": "what torques allow" if model.max_rate is None else f"{np.rad2deg(model.max_rate):.4g} deg/s",
+        "CONE_RATE_DEG": f"{config.cone_rate_deg:g}",
         "GUIDE_RATE_DEG": f"{np.rad2deg(made.guide.rate):.4g}",
         **{f"STATED_{name.upper()}": f"{error:g}" for name, error in config.error_bounds.model_dump().items()},
         **_limits(metadata.torque_limit),
@@ -108,6 +101,8 @@ def _shield_constants(made: shield.Shield, model: Model, metadata: Metadata) -> 
         "INERTIA_ERROR": brake.inertia_error,
         "DISTURBANCE": brake.disturbance,
         "RATE_ERROR": brake.rate_error,
+        "CONE_RATE": brake.cone_rate,
+        "SOON_STEPS": brake_path.SOON_STEPS,
         "SMALLEST_MOMENT": brake.smallest_moment,
         "LARGEST_MOMENT": brake.largest_moment,
         "SPEED_PER_MOMENTUM": brake_path.situation(pointing_constraints.absent(1, boresight_B), model).speed[0],

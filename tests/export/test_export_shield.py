@@ -134,6 +134,17 @@ def test_it_decides_as_the_core_does_where_there_is_a_rate_limit(agent, tmp_path
 
 
 @pytest.mark.slow
+def test_it_decides_as_the_core_does_where_cones_turn(agent, tmp_path):
+    config = ShieldConfig(cone_rate_deg=0.5)
+    write_files(tmp_path, export(agent, "c", config))
+    assert "cone_rate = 0.0087" in (tmp_path / "koz_shield.c").read_text()
+    assert "turn by up to 0.5 deg/s" in (tmp_path / "koz_shield.h").read_text()
+    check_alike(agent, CLibrary(tmp_path), config)
+    done = tiny.make_test(tmp_path)
+    assert done.returncode == 0 and done.stdout.count("passed") == 2, done.stdout + done.stderr
+
+
+@pytest.mark.slow
 def test_it_decides_as_the_core_does_on_a_cubesat(agent, tmp_path):
     inertia = ((0.05, 0.0, 0.0), (0.0, 0.06, 0.0), (0.0, 0.0, 0.02))
     other = of_the_task(agent, inertia=inertia, torque_limit=0.004, boresight=(0.0, 0.0, 1.0))

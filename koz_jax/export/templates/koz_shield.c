@@ -30,6 +30,8 @@ static const float attitude_error = @ATTITUDE_ERROR@; /* [rad] largest, of what 
 static const float rate_error = @RATE_ERROR@; /* [rad/s] */
 static const float inertia_error = @INERTIA_ERROR@; /* relative */
 static const float disturbance = @DISTURBANCE@; /* [N m] */
+static const float cone_rate = @CONE_RATE@; /* [rad/s] largest, of a zone's axis */
+static const float soon_steps = @SOON_STEPS@; /* in which a slow craft comes to rest */
 static const float guide_rate = @GUIDE_RATE@; /* [rad/s] around a zone */
 static const float guide_seconds = @GUIDE_SECONDS@; /* [s] in which the guide takes up its rate */
 static const float guide_tilt = @GUIDE_TILT@; /* of the way around, away from the zone */
@@ -190,9 +192,11 @@ typedef struct {
     float gyroscopic;  /* [rad] at its end, of a wrong inertia's gyroscopic torque */
     float drift;       /* [rad/s] per second of free motion */
     float integration; /* [rad] */
+    float soon;        /* [rad] that zones turn in some steps */
+    float swept;       /* [rad] that they turn in the rest of the brake's time */
 } tolerance;
 
-static tolerance tolerance_of(float rate, float length, float push_error)
+static tolerance tolerance_of(float momentum, float rate, float length, float push_error)
 {
     const float trust = inertia_error / (1.0f - inertia_error);
     const float arc = rate * length, piece = arc / (float)SAMPLES, turned = rate * KOZ_STEP_SECONDS;
@@ -205,6 +209,8 @@ static tolerance tolerance_of(float rate, float length, float push_error)
     found.gyroscopic *= arc * arc;
     found.drift = 2.0f * (rate_error + push_error);
     found.integration = (float)SAMPLES * piece * piece * piece * piece * piece / 120.0f;
+    found.soon = cone_rate * soon_steps * KOZ_STEP_SECONDS;
+    found.swept = cone_rate * larger(momentum / brake_limit - (soon_steps - 2.0f) * KOZ_STEP_SECONDS, 0.0f);
     return found;
 }
 
@@ -212,7 +218,7 @@ static float tolerated(const tolerance *bound, float share, float seconds)
 {
     const float time = 1.0f - sqrtf(larger(1.0f - share, 0.0f));
     return bound->at_rest * time * time + bound->gyroscopic * (2.0f * time * time - time * time * time * time)
-        + bound->drift * seconds + bound->integration;
+        + bound->drift * seconds + bound->integration + bound->soon + bound->swept * time;
 }
 
 /*
@@ -229,7 +235,7 @@ static float clearance(const koz_situation *now, const body_state *body, float p
     speed = smaller(speed_per_momentum * momentum, rate);
     length = free_seconds(momentum);
     piece = length / (float)SAMPLES;
-    bound = tolerance_of(rate, length, push_error);
+    bound = tolerance_of(momentum, rate, length, push_error);
     koz_rotate(body->q_BN, koz_boresight_B, look_N);
     for (zone = 0; zone < KOZ_ZONES; zone++) {
         if (now->zone_half_angle[zone] <= 0.0f) continue;
@@ -270,7 +276,7 @@ static float step_clearance(
         lowest = smaller(
             lowest, margin_at(now, zone, larger(koz_dot(axis_N, start_N), koz_dot(axis_N, end_N)) + bulge));
     }
-    return lowest;
+    return lowest - cone_rate * dt;
 }
 
 /* Torque against the angular momentum as it stands in the middle of the step. */
@@ -426,7 +432,7 @@ static void allow(const koz_situation *now, const float requested_B[3], float al
 {
     search at;
     body_state after;
-    float request_B[3], around_B[3], away_B[3], brake_B[3], momentum, braking, nearest, least;
+    float request_B[3], around_B[3], away_B[3], brake_B[3], momentum, braking, nearest, present, least;
     int i;
     at.now = now;
     at.body = body_of(now);
@@ -442,8 +448,12 @@ static void allow(const koz_situation *now, const float requested_B[3], float al
     (void)twice_energy(&at.body, &momentum);
     /* Of a slow state the clearance is known well, and what is no worse will do; inside a zone any way out is good. */
     if (momentum <= slow_steps * brake_limit * KOZ_STEP_SECONDS || nearest <= 0.0f) at.present = braking;
+    present = at.present;
+    /* Straight away from a zone that comes is good at any speed. */
+    if (cone_rate > 0.0f) at.present = braking;
     least = smaller(0.5f * shield_margin, at.present);
     if (braking < 0.5f * shield_margin && passes(&at, 1.0f, away_B, away_B, least, allowed_B)) return;
+    at.present = present;
     least = smaller(shield_margin, at.present + least_gain);
     for (i = 0; i < REQUEST_SHARES; i++)
         if (passes(&at, request_shares[i], request_B, around_B, least, allowed_B)) return;

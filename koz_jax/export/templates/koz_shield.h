@@ -7,6 +7,7 @@
  *     @STATED_RATE_NOISE_DEG@ deg/s per axis in the measured rate (likewise),
  *     @STATED_ATTITUDE_BIAS_DEG@ deg and @STATED_RATE_BIAS_DEG@ deg/s of constant error in what is measured.
  * Keeps the body rate below @MAX_RATE_DEG@.
+ * Axes of zones may turn by up to @CONE_RATE_DEG@ deg/s; tell it of zones where they are.
  * Leads around a zone at @GUIDE_RATE_DEG@ deg/s, and looks at @SAMPLES@ points of a brake path.
  *
 @HEAD@
