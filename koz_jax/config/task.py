@@ -43,7 +43,8 @@ class SpacecraftConfig(Settings):
     torque_limit: TorqueLimit = 2.0
     """Largest torque about each body axis [N m]: one number for all, or one for each; of no effect beside wheels."""
     wheels: tuple[WheelConfig, ...] = ()
-    """Reaction wheels that make the torque, at least three; none for actuators without momentum."""
+    """Reaction wheels that make the torque, at least three, of each its axis, largest torque [N m] and largest momentum
+    [N m s], and its momentum at the start; none for actuators without momentum."""
     max_rate_deg: PositiveFloat | None = None
     """Largest norm of the body rate [deg/s], for agents that keep one; None sets no limit."""
 

@@ -232,6 +232,20 @@ def test_every_setting_can_be_given_as_a_flag():
     assert parse(tiny.FLAGS)[0] == tiny.CONFIG
 
 
+def test_wheels_are_rows_of_six_numbers(capsys):
+    rows = "1 0 0 2 20 0  0 1 0 2 20 -3  0 0 1 2 20 0.5".split()
+    config, _ = parse(["--task.spacecraft.wheels", *rows])
+    found = config.task.spacecraft.wheels
+    assert [wheel.axis for wheel in found] == [(1, 0, 0), (0, 1, 0), (0, 0, 1)]
+    assert [(wheel.max_torque, wheel.max_momentum, wheel.momentum) for wheel in found] == [
+        (2.0, 20.0, 0.0),
+        (2.0, 20.0, -3.0),
+        (2.0, 20.0, 0.5),
+    ]
+    assert tiny.status("train", "--task.spacecraft.wheels", *rows[:-1], "x") == 2
+    assert "task.spacecraft.wheels.2.momentum: Input should be a valid number" in capsys.readouterr().err
+
+
 def test_arguments_reach_the_training(monkeypatch, capsys, empty_cwd):
     calls = []
 

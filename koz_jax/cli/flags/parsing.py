@@ -14,6 +14,7 @@ from pydantic.fields import FieldInfo
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from koz_jax.config.base import Settings
+from koz_jax.config.wheels import WheelConfig
 from koz_jax.errors import SettingsError, explain
 
 Flags = TypeVar("Flags", bound=Settings)
@@ -190,3 +191,20 @@ def _number(word: str) -> int | float | str:
         except ValueError:
             pass
     return word
+
+
+@_REGISTRY.primitive_rule
+def _wheel(type_info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """A wheel is six numbers: its axis, and then what else it has, in the order of its settings."""
+    if type_info.type is not WheelConfig:
+        return None
+    names = [*WheelConfig.model_fields]
+    return PrimitiveConstructorSpec(
+        nargs=2 + len(names),
+        metavar="X Y Z MAX-TORQUE MAX-MOMENTUM MOMENTUM",
+        instance_from_str=lambda args: {"axis": tuple(args[:3]), **dict(zip(names[1:], args[3:], strict=True))},
+        is_instance=lambda instance: isinstance(instance, WheelConfig),
+        str_from_instance=lambda wheel: [
+            str(number) for number in (*wheel.axis, *list(wheel.model_dump().values())[1:])
+        ],
+    )
