@@ -98,13 +98,17 @@ void koz_observe(koz_memory *memory, const koz_situation *now, float observation
     }
 @OBSERVE_SPACECRAFT@}
 
-/* y = x kernel + bias */
+/* y = x kernel + bias; about half of what a layer gives is zero, and is passed over */
 static void dense(const float *x, int inputs, const float *kernel, const float *bias, int outputs, float *y)
 {
     int i, j;
     for (j = 0; j < outputs; j++) y[j] = bias[j];
-    for (i = 0; i < inputs; i++)
-        for (j = 0; j < outputs; j++) y[j] += x[i] * kernel[i * outputs + j];
+    for (i = 0; i < inputs; i++) {
+        const float value = x[i];
+        const float *row = kernel + i * outputs;
+        if (!(fabsf(value) <= 0.0f)) /* what is not a number is not passed over */
+            for (j = 0; j < outputs; j++) y[j] += value * row[j];
+    }
 }
 
 @HELPERS@void koz_decide(const float observation[KOZ_OBSERVATION_SIZE], float action[KOZ_ACTION_SIZE])
