@@ -1,6 +1,7 @@
 """The console command ``koz``: finds the sub-command, and imports nothing but that."""
 
 import importlib
+import os
 import sys
 from collections.abc import Sequence
 
@@ -26,15 +27,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name in COMMANDS:
         return importlib.import_module(f"koz_jax.cli.{name}").main(others)
     if name in ("-h", "--help"):
-        print(_usage())
-        return 0
+        return _tell(_usage())
     if name == "--version":
         from koz_jax.config.version import version
 
-        print(f"koz_jax {version()}")
-        return 0
+        return _tell(f"koz_jax {version()}")
     print(f"error: command: must be one of {', '.join(COMMANDS)}; got {name!r}", file=sys.stderr)
     return 2
+
+
+def _tell(text: str) -> int:
+    """Print a text.  Returns the exit status: 141 where nobody reads on, as in a shell."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        # Nor may Python's last flush complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    return 0
 
 
 def _usage() -> str:

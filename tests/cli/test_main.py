@@ -1,6 +1,7 @@
 """The console command: its sub-commands, what finding them costs, and how it names itself."""
 
 import re
+import subprocess
 import sys
 
 import pytest
@@ -142,3 +143,14 @@ def test_without_matplotlib_the_error_says_what_to_install(argv, tmp_path):
     assert done.returncode == 2
     assert done.stderr.startswith("error: matplotlib: cannot be imported; install it with: pip install 'koz_jax[viz]'")
     assert len(done.stderr.splitlines()) == 1 and not (tmp_path / "out").exists()
+
+
+def test_help_that_nobody_reads_ends_quietly():
+    command = [sys.executable, "-m", "koz_jax", "--help"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=tiny.environment(), cwd=tiny.ROOT
+    ) as process:
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 141
