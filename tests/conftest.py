@@ -9,7 +9,7 @@ from pathlib import Path
 
 # Numbers are compared with those of the CPU: also where a GPU is present, and in subprocesses.
 os.environ["JAX_PLATFORMS"] = os.environ.get("KOZ_JAX_TEST_PLATFORM", "cpu")
-# Most of the time goes into compiling: without optimisation that takes a third, though loops then run more slowly.
+# Most of the time goes into compiling: without optimisation that takes less than half, though loops run slower.
 _QUICK = ["--xla_backend_optimization_level=0"]
 if version("jaxlib").startswith("0.10."):  # others end a process at the name of a flag that they do not know
     _QUICK.append("--xla_cpu_use_fusion_emitters=false")

@@ -28,7 +28,7 @@ from koz_jax.task.environment import Reorientation
 from koz_jax.task.observation_layout import ACTION_SIZE
 from koz_jax.task.reward import Outcome
 from koz_jax.task.scenario import SamplingRule
-from koz_jax.task.state import EnvState
+from koz_jax.task.state import EnvState, largest_rate
 
 Tree = TypeVar("Tree")
 
@@ -141,9 +141,10 @@ def fly_maneuver(
         observed = env.observe(measured)
         stepped = env.step(state, controller.act(observed) + nudge, measured=measured, truth=truth)
         cost = step_cost(stepped.outcome, env, config.refine)
-        if env.model.max_rate is not None:
+        largest = largest_rate(stepped.state, env.model)
+        if largest is not None:
             rate = rotations.norm(stepped.state.body.omega_BN_B)
-            cost = cost + config.refine.rate_weight * rate_cost(rate, env.model.max_rate)
+            cost = cost + config.refine.rate_weight * rate_cost(rate, largest)
         return stepped.state, (cost, observed)
 
     nudges = jnp.zeros((config.refine_steps, ACTION_SIZE)) if nudges is None else nudges

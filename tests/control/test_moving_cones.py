@@ -87,15 +87,22 @@ def test_whoever_steers_into_a_cone_that_turns_does_not_get_there(name):
     assert not np.any(np.asarray(found.violated)[covered])
 
 
+def crossing(rate_deg: float) -> Scenario:
+    """A quarter turn of the telescope from +y to +x; a cone comes down from 40 deg above the middle of its way."""
+    middle, up = np.array([1.0, 1.0, 0.0]) / np.sqrt(2.0), np.array([0.0, 0.0, 1.0])
+    axis = np.cos(np.deg2rad(40.0)) * middle + np.sin(np.deg2rad(40.0)) * up
+    zone = (axis, 20.0, (1.0, 0.0, 0.0), -rate_deg * np.cross(middle, up))
+    return maneuver((np.cos(np.pi / 4), 0.0, 0.0, np.sin(np.pi / 4)), zones=[zone])
+
+
 @pytest.mark.slow
 def test_a_plan_is_made_for_where_the_cone_will_be():
-    """The cone reaches the direct way when the boresight would: planned for where it was, the path meets it."""
-    zone = ((0.0, 0.0, 1.0), 20.0, (1.0, 0.0, 0.0), (3.0, 0.0, 0.0))
-    drawn = maneuver((np.cos(np.pi / 4), 0.0, 0.0, np.sin(np.pi / 4)), zones=[zone])
-    task = TaskConfig(episode_seconds=60.0)
-    planner = load_controller("planner")
-    _, result = cases.fly_scenario(planner, drawn, task, MonteCarloConfig(substeps=5))
-    assert result.success and np.rad2deg(result.min_margin) > 0.5
+    """The cone is clear of the direct way at the start, and there when the telescope is."""
+    task, config = TaskConfig(episode_seconds=60.0), MonteCarloConfig(substeps=5)
+    (_, still), (_, coming) = (cases.fly_scenario(load_controller("pd"), crossing(r), task, config) for r in (0.0, 6.0))
+    assert not still.violated and coming.violated
+    _, planned = cases.fly_scenario(load_controller("planner"), crossing(6.0), task, config)
+    assert planned.success and np.rad2deg(planned.min_margin) > 0.5
 
 
 def test_a_shield_for_slower_cones_is_refused_by_name():

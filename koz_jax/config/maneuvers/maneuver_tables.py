@@ -53,17 +53,11 @@ class Table(Settings):
         return given
 
 
-class WheelTable(Table):
+class WheelTable(Table, WheelConfig):
     """A reaction wheel."""
 
     axis: Direction
     """Its axis, in body axes; normalised on reading."""
-    max_torque: PositiveFloat
-    """Largest torque of its motor [N m]."""
-    max_momentum: PositiveFloat
-    """Largest angular momentum that it holds [N m s]."""
-    momentum: float = 0.0
-    """Angular momentum at the start [N m s]."""
 
 
 class BodyConfig(Table):

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from koz_jax.config.task import SpacecraftConfig
+from koz_jax.errors import SettingsError
 from koz_jax.task import host
 from koz_jax.task.host import Floats
 from koz_jax.task.observation_layout import FREE_RATE, FULL_ACTION, SHORTEST_STEP
@@ -30,7 +31,13 @@ def of(spacecraft: SpacecraftConfig, step_seconds: float, boresight: npt.ArrayLi
     """The constants of a spacecraft.
 
     step_seconds: time step [s]; boresight: (3,) unit vector of an instrument in body axes, by default the spacecraft's.
+
+    Raises:
+        SettingsError: it has wheels, whose limits are no constants.
+
     """
+    if spacecraft.wheels:
+        raise SettingsError("spacecraft.wheels: are flown by jax only so far; allowed here is torque_limit")
     axes = policy_axes(host.unit("boresight", spacecraft.boresight if boresight is None else boresight, 3))
     inertia_B, limits = np.array(spacecraft.inertia), np.array(spacecraft.torque_limits)
     time, torque = spacecraft.time_unit, spacecraft.strength
