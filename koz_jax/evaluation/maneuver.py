@@ -34,9 +34,7 @@ class FlownManeuver:
     result: CaseResult
     margins_deg: np.ndarray  # (constraints,) [deg] smallest margin to each, those that are absent left out
     peak_rate_deg: float  # [deg/s] largest norm of the body rate
-    peak_momentum_share: float | None = (
-        None  # of the wheels' limits, the most that any of them held; None without wheels
-    )
+    peak_momentum_share: float | None = None  # most that any wheel held, of its limit; None without wheels
 
     def report(self) -> dict[str, Any]:
         """What ``koz fly --json`` writes; None stands for what there is not."""
@@ -49,18 +47,16 @@ class FlownManeuver:
             "end_error_deg": _number(np.rad2deg(result.control_accuracy)),
             "min_margin_deg": _number(self.margins_deg.min()) if len(self.margins_deg) else None,
             "peak_rate_deg": _number(self.peak_rate_deg),
-            "peak_wheel_momentum_share": None
-            if self.peak_momentum_share is None
-            else _number(self.peak_momentum_share),
+            "peak_wheel_momentum_share": _number(self.peak_momentum_share),
             "intervention_rate": _number(result.intervention_rate),
             "deadlocked": bool(result.deadlocked),
             "margins_deg": [_number(margin) for margin in self.margins_deg],
         }
 
 
-def _number(value: npt.ArrayLike) -> float | None:
-    """A number with the digits that float32 has; None for one that is not finite."""
-    return float(f"{float(np.asarray(value)):.7g}") if np.isfinite(value) else None
+def _number(value: npt.ArrayLike | None) -> float | None:
+    """A number with the digits that float32 has; None for none, and for one that is not finite."""
+    return float(f"{float(np.asarray(value)):.7g}") if value is not None and np.isfinite(value) else None
 
 
 def scenario(maneuver: ManeuverConfig) -> Scenario:

@@ -174,7 +174,9 @@ class ReactionWheels(struct.PyTreeNode):
         by_momentum = (jnp.min((self.max_momentum - idle) / share) - total) / moments[2]
         difference = moments[2] - moments[0]
         reserve = (1.0 - BRAKE_SHARE) * jnp.min(self.box_B)
-        by_torque = 2.0 * reserve / (total + jnp.sqrt(total**2 + 2.0 * difference * reserve) + 1e-12 * moments[2])
+        # The root of the quadratic equation, in the form that does not cancel.
+        divisor = total + jnp.sqrt(total**2 + 2.0 * difference * reserve)
+        by_torque = jnp.where(divisor > 0.0, 2.0 * reserve / jnp.where(divisor > 0.0, divisor, 1.0), jnp.inf)
         return jnp.maximum(jnp.minimum(by_momentum, by_torque), 0.0)
 
     @property

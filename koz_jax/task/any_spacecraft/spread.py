@@ -6,11 +6,10 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from koz_jax.config import wheels
 from koz_jax.config.spread import SpreadConfig
-from koz_jax.config.task import TaskConfig
+from koz_jax.config.task import SpacecraftConfig, TaskConfig
 from koz_jax.config.wheels import WheelConfig
-from koz_jax.task import rotations
+from koz_jax.task import actuators, rotations
 from koz_jax.task.actuators import Actuators, ReactionWheels, TorqueBox
 from koz_jax.task.any_spacecraft import units
 from koz_jax.task.any_spacecraft.units import Units
@@ -118,17 +117,17 @@ def _sample_actuators(spread: Spread, own: Units, key: jax.Array) -> Actuators:
         return TorqueBox(own.torque * limits / jnp.sqrt(jnp.mean(limits**2)))
     key_size, key_bias = jax.random.split(key)
     of_one = tuple(WheelConfig(axis=axis, max_torque=1.0, max_momentum=1.0) for axis in _WHEEL_AXES[spread.wheels])
-    box = jnp.array(wheels.torque_box(of_one), jnp.float32)
-    strength = jnp.full(len(of_one), own.torque / jnp.sqrt(jnp.mean(box**2)))
+    made = actuators.from_config(SpacecraftConfig(wheels=of_one))
+    assert isinstance(made, ReactionWheels)
+    strength = own.torque / jnp.sqrt(jnp.mean(made.box_B**2))
     low, high = spread.wheel_momentum
     largest = jax.random.uniform(key_size, (), minval=low, maxval=high) * own.torque * own.time
-    return ReactionWheels(
-        axes_B=jnp.array([wheel.axis for wheel in of_one], jnp.float32),
-        allocation=jnp.array(wheels.allocation(of_one), jnp.float32),
-        max_torque=strength,
-        max_momentum=jnp.full(len(of_one), largest),
-        momentum=_BIAS * largest * jax.random.uniform(key_bias, (len(of_one),), minval=-1.0, maxval=1.0),
-        box_B=strength[0] * box,
+    bias = _BIAS * jax.random.uniform(key_bias, (len(of_one),), minval=-1.0, maxval=1.0)
+    return made.replace(
+        max_torque=strength * made.max_torque,
+        max_momentum=largest * made.max_momentum,
+        momentum=largest * bias,
+        box_B=strength * made.box_B,
     )
 
 
