@@ -28,6 +28,9 @@ _ZONE = {
 
 _SCALED_ZONE = {"zone_margin": 1, "zone_angle": 1, "zone_direction_P": 3}
 
+# That of the first one is the x axis.
+_FURTHER_SCALED_ZONE = {"boresight_P": 3, **_SCALED_ZONE}
+
 # What a policy for any spacecraft also sees, after attitude, rate and zones; see ``any_spacecraft.nondimensional``.
 _SPACECRAFT = {
     "inertia": 6,  # [J] xx, yy, zz, xy, xz, yz of the tensor
@@ -81,8 +84,8 @@ def layout(zones: int = 1, scaled: bool = False) -> Mapping[str, int]:
     scaled: for a policy for any spacecraft, see ``any_spacecraft.nondimensional``.
     """
     if scaled:
-        seen = {zone_part(number, name): size for number in range(zones) for name, size in _SCALED_ZONE.items()}
-        return MappingProxyType({"q_e": 4, "omega_BN_P": 3} | seen | _SPACECRAFT)
+        further = {zone_part(n, name): size for n in range(1, zones) for name, size in _FURTHER_SCALED_ZONE.items()}
+        return MappingProxyType({"q_e": 4, "omega_BN_P": 3} | _SCALED_ZONE | further | _SPACECRAFT)
     first = {
         "q_e": 4,  # attitude relative to the target
         "omega_BN_B": 3,  # [rad/s]
@@ -104,6 +107,8 @@ def meaning(part: str, scaled: bool = False) -> str:
     number, _, name = part.partition("_")
     if not number.isdigit():
         return (_SCALED_MEANING if scaled else _MEANING).get(part, _MEANING[part])
+    if name == "boresight_P":
+        return f"unit vector of the instrument that zone {number} is for, in the policy's axes; 0 where there is none"
     absent = "0" if name.startswith("zone_direction") else "pi"
     return f"the same of zone {number} in the order of the margins; {absent} where there is none"
 

@@ -23,7 +23,7 @@ def observe(state: EnvState, model: Model, urgency: jax.Array | float, zones: in
     """What the policy sees.
 
     urgency: () in [0, 1].  Returns (entries,), in the order of ``layout(zones, scaled=True)``; a zone that is absent
-    reads margin pi, angle pi and direction zero.
+    reads margin pi, angle pi, and directions zero.
     """
     nearest = observation.nearest_constraints(state, zones)
     axes = units.policy_axes(nearest.boresight_B[0])
@@ -40,7 +40,10 @@ def observe(state: EnvState, model: Model, urgency: jax.Array | float, zones: in
     }
     for number in range(zones):
         zone = jax.tree.map(lambda leaf, i=number: leaf[i], nearest)
-        parts |= {zone_part(number, name): value for name, value in _zone_parts(state, zone, axes).items()}
+        seen = _zone_parts(state, zone, axes)
+        if number:
+            seen["boresight_P"] = jnp.where(zone.is_present, dynamics.matvec(axes, zone.boresight_B), 0.0)
+        parts |= {zone_part(number, name): value for name, value in seen.items()}
     return jnp.concatenate([parts[name] for name in layout(zones, scaled=True)])
 
 
