@@ -35,7 +35,7 @@ def _list(_: AgentsFlags) -> int:
 def _row(name: str, record: Record) -> tuple[str, ...]:
     """What an agent was trained for, and its table in short."""
     scenario, table = record.task.scenario, record.provenance.table
-    few, many = scenario.min_zones, scenario.max_zones
+    few, many = record.task.zones
 
     def told(key: str, form: str) -> str:
         return form.format(table[key]) if key in table else "-"

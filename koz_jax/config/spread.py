@@ -6,10 +6,11 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from koz_jax.config.base import Fraction, PositiveFloat, Settings
+from koz_jax.config.base import Fraction, PositiveFloat, Settings, ZoneCount
 from koz_jax.config.uncertainty import CERTAIN, DelaySteps, UncertaintyConfig
 
 Urgency = Annotated[float, Field(ge=0, le=1)]
+InstrumentCount = Annotated[int, Field(ge=1, le=3)]
 
 
 class SpreadConfig(Settings):
@@ -25,6 +26,13 @@ class SpreadConfig(Settings):
     a bias of up to 30 % of their momentum at the start; None by a torque box."""
     wheel_momentum: tuple[PositiveFloat, PositiveFloat] = (1.0, 4.0)
     """Largest momentum of these wheels, in units of u T."""
+    zones: tuple[ZoneCount, ZoneCount] | None = None
+    """Zones of a case, every number of them as often; None leaves the scenario's."""
+    instruments: InstrumentCount = 1
+    """Instruments of these spacecraft, each somewhere; the zone in the way is for the first, each further one for one
+    of them."""
+    keep_in: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Share of the other instruments' zones that are cones to keep them in, of half angles from 60 to 100 deg."""
     step_shares: tuple[PositiveFloat, PositiveFloat] = (0.009, 0.05)
     """Time steps of these spacecraft, in units of T = sqrt(J / u)."""
     max_rate_deg: tuple[PositiveFloat, PositiveFloat] | None = None
@@ -41,7 +49,11 @@ class SpreadConfig(Settings):
     def _ordered(self) -> Self:
         if self.wheels is not None and not self.spacecraft:
             raise ValueError(f"wheels: are drawn with spacecraft = true, got {self.wheels!r} without it")
-        for name in ("slenderness", "step_shares", "wheel_momentum", "max_rate_deg", "urgency", "delay_steps"):
+        if self.instruments > 1 and not self.spacecraft:
+            raise ValueError(f"instruments: are drawn with spacecraft = true, got {self.instruments} without it")
+        if self.keep_in and self.instruments == 1:
+            raise ValueError(f"keep_in: is for other instruments than the first, got {self.keep_in} with one")
+        for name in ("slenderness", "step_shares", "wheel_momentum", "zones", "max_rate_deg", "urgency", "delay_steps"):
             limits = getattr(self, name)
             if limits is not None and limits[0] > limits[1]:
                 raise ValueError(f"{name} must be in order; got {limits}")

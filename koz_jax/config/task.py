@@ -166,6 +166,11 @@ class TaskConfig(Settings):
         return spread.step_shares[0] * self.spacecraft.time_unit if spread.spacecraft else self.step_seconds
 
     @property
+    def zones(self) -> tuple[int, int]:
+        """Least and largest number of zones of a case."""
+        return self.spread.zones or (self.scenario.min_zones, self.scenario.max_zones)
+
+    @property
     def episode_steps(self) -> int:
         """Steps of a maneuver."""
         return round(self.episode_seconds / self.shortest_step_seconds)

@@ -39,9 +39,9 @@ def warn_of_differences(agent: TaskController, task: TaskConfig) -> None:
         return
     found = [] if agent.controller.network.scaled else differences(agent.task, task)
     seen = agent.controller.network.observed_zones
-    if seen < task.scenario.max_zones:
+    if seen < task.zones[1]:
         nearest = "the nearest zone" if seen == 1 else f"the nearest {seen} zones"
-        found.append(f"it sees {nearest} of up to {task.scenario.max_zones}")
+        found.append(f"it sees {nearest} of up to {task.zones[1]}")
     if found:
         _log.warning("%s was not made for this: %s", agent.name, "; ".join(found))
 

@@ -77,12 +77,12 @@ class Reorientation(struct.PyTreeNode):
         return cls(
             model=model_from_config(task),
             reward=reward.from_config(task.reward, task.angle_convention),
-            ranges=scenario.from_config(task.scenario, task.spacecraft.boresight, min_angle_deg, max_angle_deg),
+            ranges=scenario.from_config(task, min_angle_deg, max_angle_deg),
             action_filter=action_filter,
             uncertainty=uncertainty or errors_of(task),
             spread=spread.from_config(task),
             rule=rule or SamplingRule(task.scenario.infeasible_zone),
-            observed_zones=observed_zones or task.scenario.max_zones,
+            observed_zones=observed_zones or task.zones[1],
             episode_steps=task.episode_steps,
         )
 
@@ -90,13 +90,12 @@ class Reorientation(struct.PyTreeNode):
         """The environment of one maneuver, in which all that is spread is drawn.  key: () typed PRNG key."""
         if self.spread is None:
             return self
-        found = spread.draw(self.spread, self.model, self.ranges.boresight_B, key)
-        ranges = self.ranges.replace(boresight_B=found.boresight_B)
+        found = spread.draw(self.spread, self.model, self.ranges, key)
         uncertainty = self.uncertainty
         if uncertainty is not None and found.delay is not None:
             uncertainty = uncertainty.replace(delay=found.delay)
         return self.replace(
-            model=found.model, ranges=ranges, urgency=found.urgency, uncertainty=uncertainty, spread=None
+            model=found.model, ranges=found.ranges, urgency=found.urgency, uncertainty=uncertainty, spread=None
         )
 
     @property

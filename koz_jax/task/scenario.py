@@ -4,17 +4,20 @@ The zone sits where the boresight would be half-way along the shortest (eigen-ax
 A draw is *feasible* when start and target both lie outside the zone by at least ``separation``.
 
 Further zones, which the paper does not have, lie around the first one: as far from start and target, and with a gap to
-each other, so that a way around them is always left (what remains of the sphere is connected).
+each other, so that a way around them is always left (what remains of the sphere is connected).  Where there are several
+instruments, each further zone is for one of them, and may be a cone to keep it in; zones of different instruments have
+no gap, so that a few draws have no way.
 """
 
 import dataclasses
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
-from koz_jax.config.task import ScenarioConfig
+from koz_jax.config.task import TaskConfig
 from koz_jax.task import pointing_constraints, rotations
 from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.observation_layout import ABSENT_HALF_ANGLE
@@ -27,6 +30,12 @@ _FURTHER = 0x5A4F4E45
 
 # Places that are tried for a further zone.
 _PLACES = 32
+
+# Separates the draw of a zone's instrument from that of its place.
+_INSTRUMENT = 0x494E53
+
+# [rad] Smallest and largest half angle of a cone to keep an instrument in.
+_KEEP_IN = (np.deg2rad(60.0), np.deg2rad(100.0))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +65,8 @@ class ScenarioRanges(struct.PyTreeNode):
     separation: jax.Array  # () [rad] between a zone's edge and the boresight at start and target
     zone_gap: jax.Array  # () [rad] least gap between the edges of two zones
     min_zones: jax.Array  # () int32, least number of zones
+    keep_in: jax.Array  # () share of the other instruments' zones that are cones to keep them in
+    others_B: jax.Array | None  # (n, 3) unit vectors of other instruments; None where there are none
     max_zones: int = struct.field(pytree_node=False)  # largest number of zones, and length of their stack
 
 
@@ -137,8 +148,7 @@ def sample(key: jax.Array, ranges: ScenarioRanges, rule: SamplingRule = Sampling
         )
     zones = PointingConstraint(ranges.boresight_B[None], draw.zone_axis_D[None], half_angle[None])
     if ranges.max_zones > 1:
-        looks_D = jnp.stack([ranges.boresight_B, rotations.rotate(draw.q_e, ranges.boresight_B)])
-        zones = _add_zones(jax.random.fold_in(key, _FURTHER), ranges, looks_D, zones)
+        zones = _add_zones(jax.random.fold_in(key, _FURTHER), ranges, draw.q_e, zones)
     return Scenario(
         initial=RigidBodyState(draw.q_e, draw.omega_BN_B),
         q_DN=jnp.array([1.0, 0.0, 0.0, 0.0]),
@@ -146,33 +156,62 @@ def sample(key: jax.Array, ranges: ScenarioRanges, rule: SamplingRule = Sampling
     )
 
 
+class _Pair(NamedTuple):
+    """What a further zone is for."""
+
+    boresight_B: jax.Array  # (3,)
+    half_angle: jax.Array  # () [rad]
+    midway_D: jax.Array  # (3,) the half of the sphere around this direction is where it lies
+
+
+def _pair(key: jax.Array, ranges: ScenarioRanges, q_e: jax.Array, first: PointingConstraint) -> _Pair:
+    """Draw for which instrument a further zone is, and of what size."""
+    size = jax.random.uniform(jax.random.split(key)[1])
+    half_angle = ranges.min_half_angle + (ranges.max_half_angle - ranges.min_half_angle) * size
+    if ranges.others_B is None:
+        return _Pair(ranges.boresight_B, half_angle, first.axis_N[0])
+    key_which, key_kind = jax.random.split(jax.random.fold_in(key, _INSTRUMENT))
+    instruments_B = jnp.concatenate([ranges.boresight_B[None], ranges.others_B])
+    which = jax.random.randint(key_which, (), 0, len(instruments_B))
+    boresight_B = instruments_B[which]
+    half_turn = rotations.normalize(q_e.at[0].add(1.0))
+    midway_D = rotations.rotate(half_turn, boresight_B)
+    kept_in = (which > 0) & (jax.random.uniform(key_kind) < ranges.keep_in)
+    narrowest, widest = _KEEP_IN
+    # See ``pointing_constraints``: it is kept out of what is around the opposite direction.
+    outside = jnp.pi - (narrowest + (widest - narrowest) * size)
+    return _Pair(boresight_B, jnp.where(kept_in, outside, half_angle), jnp.where(kept_in, -midway_D, midway_D))
+
+
 def _add_zones(
-    key: jax.Array, ranges: ScenarioRanges, looks_D: jax.Array, first: PointingConstraint
+    key: jax.Array, ranges: ScenarioRanges, q_e: jax.Array, first: PointingConstraint
 ) -> PointingConstraint:
     """Put further zones within 90 deg of the first, as many as are drawn and as find a place.
 
-    looks_D: (2, 3) boresight at target and start; first: leaves (1, ...).  Returns leaves (max_zones, ...).
+    q_e: (4,) attitude at the start, relative to the target; first: leaves (1, ...).  Returns leaves (max_zones, ...).
     """
     keys = jax.random.split(key, ranges.max_zones)
     number = jax.random.randint(keys[0], (), ranges.min_zones, ranges.max_zones + 1)
     to_all = jax.vmap(rotations.angle_between, in_axes=(None, 0))
 
     def add(i: jax.Array, zones: PointingConstraint) -> PointingConstraint:
-        key_axis, key_size = jax.random.split(keys[i])
-        size = jax.random.uniform(key_size)
-        half_angle = ranges.min_half_angle + (ranges.max_half_angle - ranges.min_half_angle) * size
-        axes = jax.vmap(rotations.normalize)(jax.random.normal(key_axis, (_PLACES, 3)))
-        # Mirrored into the half of the sphere around the first zone.
-        axes = axes * jnp.where(axes @ first.axis_N[0] < 0.0, -1.0, 1.0)[:, None]
-        clear = jax.vmap(to_all, in_axes=(0, None))(axes, looks_D) >= half_angle + ranges.separation
-        room = half_angle + zones.half_angle + ranges.zone_gap
+        pair = _pair(keys[i], ranges, q_e, first)
+        looks_D = jnp.stack([pair.boresight_B, rotations.rotate(q_e, pair.boresight_B)])
+        axes = jax.vmap(rotations.normalize)(jax.random.normal(jax.random.split(keys[i])[0], (_PLACES, 3)))
+        # Mirrored into the half of the sphere.
+        axes = axes * jnp.where(axes @ pair.midway_D < 0.0, -1.0, 1.0)[:, None]
+        clear = jax.vmap(to_all, in_axes=(0, None))(axes, looks_D) >= pair.half_angle + ranges.separation
+        room = pair.half_angle + zones.half_angle + ranges.zone_gap
         apart = jax.vmap(to_all, in_axes=(0, None))(axes, zones.axis_N) >= room[None]
+        if ranges.others_B is not None:
+            apart |= jnp.any(zones.boresight_B != pair.boresight_B[None], axis=1)[None]
         fits = jnp.all(clear, axis=1) & jnp.all(apart, axis=1)
         place = jnp.argmax(fits)
         wanted = (i < number) & fits[place]
         return zones.replace(
+            boresight_B=zones.boresight_B.at[i].set(jnp.where(wanted, pair.boresight_B, zones.boresight_B[i])),
             axis_N=zones.axis_N.at[i].set(jnp.where(wanted, axes[place], zones.axis_N[i])),
-            half_angle=zones.half_angle.at[i].set(jnp.where(wanted, half_angle, ABSENT_HALF_ANGLE)),
+            half_angle=zones.half_angle.at[i].set(jnp.where(wanted, pair.half_angle, ABSENT_HALF_ANGLE)),
         )
 
     zones = pointing_constraints.filled_up(first, ranges.max_zones)
@@ -195,12 +234,11 @@ def paper_test() -> Scenario:
     )
 
 
-def from_config(
-    config: ScenarioConfig, boresight: tuple[float, float, float], min_angle_deg: float, max_angle_deg: float
-) -> ScenarioRanges:
-    """Distribution of scenarios for an instrument, with deviations uniform between two angles [deg]."""
+def from_config(task: TaskConfig, min_angle_deg: float, max_angle_deg: float) -> ScenarioRanges:
+    """Distribution of a task's scenarios, with deviations uniform between two angles [deg]."""
+    config, (min_zones, max_zones) = task.scenario, task.zones
     return ScenarioRanges(
-        boresight_B=jnp.array(boresight),
+        boresight_B=jnp.array(task.spacecraft.boresight),
         min_angle=jnp.deg2rad(jnp.float32(min_angle_deg)),
         max_angle=jnp.deg2rad(jnp.float32(max_angle_deg)),
         angle_bias=jnp.float32(1.0),
@@ -209,6 +247,8 @@ def from_config(
         max_half_angle=jnp.deg2rad(jnp.float32(config.max_half_angle_deg)),
         separation=jnp.deg2rad(jnp.float32(config.separation_deg)),
         zone_gap=jnp.deg2rad(jnp.float32(config.zone_gap_deg)),
-        min_zones=jnp.int32(config.min_zones),
-        max_zones=config.max_zones,
+        min_zones=jnp.int32(min_zones),
+        keep_in=jnp.zeros(()),
+        others_B=None,
+        max_zones=max_zones,
     )

@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 from support import oracle
 
-from koz_jax.config.task import ScenarioConfig
+from koz_jax.config.task import ScenarioConfig, SpacecraftConfig, TaskConfig
 from koz_jax.task import scenario
 from koz_jax.task.scenario import SamplingRule, Scenario, ScenarioRanges
 
@@ -23,7 +23,8 @@ RESAMPLE, SHRINK = SamplingRule("resample"), SamplingRule("shrink")
 def _ranges(
     low: float, high: float, config: ScenarioConfig | None = None, boresight: tuple[float, float, float] = BORESIGHT
 ) -> ScenarioRanges:
-    return scenario.from_config(config or ScenarioConfig(), boresight, low, high)
+    task = TaskConfig(scenario=config or ScenarioConfig(), spacecraft=SpacecraftConfig(boresight=boresight))
+    return scenario.from_config(task, low, high)
 
 
 def _keys() -> jax.Array:
@@ -299,3 +300,29 @@ def test_the_first_zone_and_all_else_do_not_depend_on_how_many_zones_there_are(c
     first = jax.tree.map(lambda leaf: leaf[:, :1], crowded.constraints)
     for one, many in zip(jax.tree.leaves(single), jax.tree.leaves(crowded.replace(constraints=first)), strict=True):
         np.testing.assert_array_equal(one, many)
+
+
+def test_zones_of_several_instruments_leave_start_and_target_clear_and_a_gap_to_those_of_the_same_instrument():
+    others_B = jnp.array([[0.0, 1.0, 0.0], [0.0, -0.6, 0.8]])
+    many = ScenarioConfig(min_zones=1, max_zones=4)
+    ranges = _ranges(80.0, 180.0, many).replace(others_B=others_B, keep_in=jnp.float32(0.3))
+    drawn = _draw(ranges, RESAMPLE)
+    zones = drawn.constraints
+    present = np.asarray(zones.half_angle) > 0.0
+    assert np.bincount(present.sum(axis=1), minlength=5)[1:].min() > COUNT / 10
+    for attitude in (drawn.initial.q_BN, drawn.q_DN):
+        looks = np.stack([oracle.rotation(attitude).apply(zones.boresight_B[:, i]) for i in range(4)], axis=1)
+        margin = oracle.angle_between(looks, zones.axis_N) - zones.half_angle
+        assert np.rad2deg(margin[present].min()) > 2.0 - 1e-3
+    gaps = []
+    for i, j in itertools.combinations(range(4), 2):
+        same = present[:, i] & present[:, j] & np.all(zones.boresight_B[:, i] == zones.boresight_B[:, j], axis=1)
+        apart = oracle.angle_between(zones.axis_N[same, i], zones.axis_N[same, j])
+        gaps.append(np.rad2deg(apart - zones.half_angle[same, i] - zones.half_angle[same, j]))
+    assert min(gap.min() for gap in gaps) > 10.0 - 1e-3
+    of = [np.all(zones.boresight_B[present] == other, axis=1) for other in np.vstack([[BORESIGHT], others_B])]
+    assert np.sum(of) == present.sum() and min(each.sum() for each in of) > COUNT / 5
+    # A cone that an instrument is kept in is wider outside than any that it is kept out of.
+    wide = np.asarray(zones.half_angle)[present] > np.deg2rad(30.0 + 1e-3)
+    assert not wide[of[0]].any() and 0.02 < wide[~of[0]].mean() < 0.3
+    assert np.rad2deg(np.asarray(zones.half_angle)[present][wide].min()) > 80.0 - 1e-3

@@ -13,6 +13,7 @@ from koz_jax.task import actuators, rotations
 from koz_jax.task.actuators import Actuators, ReactionWheels, TorqueBox
 from koz_jax.task.any_spacecraft import units
 from koz_jax.task.any_spacecraft.units import Units
+from koz_jax.task.scenario import ScenarioRanges
 from koz_jax.task.state import Model
 
 # Smallest second moment of a body of unit largest one: no body is thinner.
@@ -23,6 +24,9 @@ PURPOSE = 0x535052
 
 # Separates the key of the delay from those of the other draws.
 _DELAY = 0x44454C
+
+# Separates the key of the other instruments from those of the other draws.
+_OTHERS = 0x4F5448
 
 # Share of the maneuvers at either end of the urgencies, beyond which an agent learns nothing.
 _AT_AN_END = 1.0 / 7.0
@@ -50,6 +54,8 @@ class Spread(struct.PyTreeNode):
     delays: jax.Array  # (2,) int32
     slenderness: jax.Array  # (2,) smallest over largest second moment
     wheel_momentum: jax.Array  # (2,) [u T]
+    keep_in: jax.Array  # () share of the other instruments' zones that are cones to keep them in
+    instruments: int = struct.field(pytree_node=False)
     spacecraft: bool = struct.field(pytree_node=False)
     rate_limits: bool = struct.field(pytree_node=False)
     late: bool = struct.field(pytree_node=False)
@@ -61,12 +67,12 @@ class Drawn(struct.PyTreeNode):
     """What is drawn for one maneuver."""
 
     model: Model
-    boresight_B: jax.Array  # (3,) unit vector of the instrument
+    ranges: ScenarioRanges  # for its instruments
     urgency: jax.Array  # ()
     delay: jax.Array | None  # () int32; None where it is not spread
 
 
-def draw(spread: Spread, model: Model, boresight_B: jax.Array, key: jax.Array) -> Drawn:
+def draw(spread: Spread, model: Model, ranges: ScenarioRanges, key: jax.Array) -> Drawn:
     """Draw for one maneuver; what is not spread is as given.  key: () typed PRNG key."""
     key_body, key_boresight, key_rate, key_urgency = jax.random.split(key, 4)
     delay = None
@@ -76,10 +82,19 @@ def draw(spread: Spread, model: Model, boresight_B: jax.Array, key: jax.Array) -
     if spread.spacecraft:
         model = _sample_body(spread, model, key_body)
         boresight_B = rotations.normalize(jax.random.normal(key_boresight, (3,)))
+        ranges = ranges.replace(boresight_B=boresight_B, others_B=_others(spread, key), keep_in=spread.keep_in)
     if spread.rate_limits:
         low, high = jnp.log(spread.max_rates)
         model = model.replace(max_rate=jnp.exp(jax.random.uniform(key_rate, (), minval=low, maxval=high)))
-    return Drawn(model, boresight_B, _urgency(spread, key_urgency), delay)
+    return Drawn(model, ranges, _urgency(spread, key_urgency), delay)
+
+
+def _others(spread: Spread, key: jax.Array) -> jax.Array | None:
+    """Boresights of the instruments after the first.  Returns (n, 3); None where there are none."""
+    if spread.instruments == 1:
+        return None
+    drawn = jax.random.normal(jax.random.fold_in(key, _OTHERS), (spread.instruments - 1, 3))
+    return jax.vmap(rotations.normalize)(drawn)
 
 
 def _urgency(spread: Spread, key: jax.Array) -> jax.Array:
@@ -158,5 +173,7 @@ def from_config(task: TaskConfig) -> Spread | None:
         slenderness=jnp.array(config.slenderness or (1.0, 1.0)),
         slender=config.slenderness is not None,
         wheel_momentum=jnp.array(config.wheel_momentum),
+        keep_in=jnp.float32(config.keep_in),
+        instruments=config.instruments,
         wheels=config.wheels,
     )
