@@ -13,7 +13,8 @@ os.environ["JAX_PLATFORMS"] = os.environ.get("KOZ_JAX_TEST_PLATFORM", "cpu")
 _QUICK = ["--xla_backend_optimization_level=0"]
 if version("jaxlib").startswith("0.10."):  # others end a process at the name of a flag that they do not know
     _QUICK.append("--xla_cpu_use_fusion_emitters=false")
-os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *_QUICK])
+if os.environ["JAX_PLATFORMS"] == "cpu":
+    os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *_QUICK])
 
 import jax
 import pytest

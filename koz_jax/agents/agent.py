@@ -19,7 +19,7 @@ from koz_jax.config.spread import SpreadConfig
 from koz_jax.config.task import TaskConfig
 from koz_jax.control.policy import PolicyController, policy_network
 from koz_jax.errors import SettingsError
-from koz_jax.storage import archive
+from koz_jax.storage import archive, runtime
 from koz_jax.task import observation_layout
 from koz_jax.task.observation_layout import as_observations
 
@@ -73,6 +73,7 @@ class Agent:
 
 
 @jax.jit
+@runtime.in_float32
 def _act(controller: PolicyController, observed: jax.Array) -> jax.Array:
     return controller.act(observed)
 

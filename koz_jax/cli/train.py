@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -43,6 +43,8 @@ class TrainFlags(ProcessFlags):
     """Monte Carlo cases of the table at the end; by default 10,000, or as many as a resumed run was begun with."""
     devices: PositiveInt = 1
     """Divide the environments and the replay buffer among so many devices of each process (not with --seeds)."""
+    sizes: Literal["auto", "cpu", "gpu"] = "auto"
+    """Batches and lengths of the preset that suit this device, or that of another; what is set by a flag stays."""
     seeds: Annotated[int, Field(gt=0, le=1000)] = 1
     """Train so many seeds, from --seed on, each on a core of its own; the best by evaluation is the run's agent."""
 
@@ -110,12 +112,14 @@ def _train(config: TrainConfig, asked: TrainFlags, command: str) -> int:
     from koz_jax.runs.trainer import train
     from koz_jax.storage import processes, runtime
 
+    runtime.configure()
+    asked.join()
+    if not asked.resume:
+        config = _sized(config, asked.sizes)
     new = Path("runs", time.strftime(f"{config.preset}-seed{config.seed}-%Y%m%d-%H%M%S"))
     run = asked.resume or asked.run or new
     if asked.seeds > 1 or (asked.resume is not None and os.path.isfile(run / "seeds.json")):
         return _train_seeds(config, asked, run, command)
-    runtime.configure()
-    asked.join()
     if asked.resume:
         config = processes.all_or_none(RunFolder(run).read_config)
     agent = train(
@@ -128,6 +132,20 @@ def _train(config: TrainConfig, asked: TrainFlags, command: str) -> int:
     )
     # The others wait for the first, which reports.
     return processes.all_or_none(lambda: 0 if asked.process > 0 else _report(agent, config, _cases(asked, run), run))
+
+
+def _sized(config: TrainConfig, asked: str) -> TrainConfig:
+    """Settings with the sizes that are asked for; says what that changes."""
+    from koz_jax.config import sizes
+    from koz_jax.storage import runtime
+
+    if asked == "cpu" or (asked == "auto" and not runtime.on_gpu()):
+        return config
+    sized, changed = sizes.for_gpu(config)
+    if changed:
+        told = ", ".join(f"{name} {value}" for name, value in changed.items())
+        print(f"sizes for a GPU: {told}", file=sys.stderr)
+    return sized
 
 
 def _report(agent: Agent | None, config: TrainConfig, cases: int, run: Path) -> int:
@@ -161,12 +179,10 @@ def _stopped(run: Path) -> int:
 
 def _train_seeds(config: TrainConfig, asked: TrainFlags, run: Path, command: str) -> int:
     from koz_jax.runs import seeds
-    from koz_jax.storage import runtime
 
     for name in ("devices", "processes"):
         if getattr(asked, name) > 1:
             raise SettingsError(f"{name}: must be 1 for several seeds, as in {run}; got {getattr(asked, name)}")
-    runtime.configure()
     if asked.resume is None:
         start_from = None if asked.start_from is None else str(asked.start_from.resolve())
         plan = seeds.Plan(config=config, seeds=asked.seeds, start_from=start_from, cases=asked.cases or _CASES)

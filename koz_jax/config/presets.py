@@ -111,7 +111,7 @@ def _thorough() -> TrainConfig:
 
 
 def _universal() -> TrainConfig:
-    """An agent for any spacecraft: it is drawn anew for every maneuver, with a rate limit and an urgency."""
+    """An agent for any spacecraft: it is drawn anew for every maneuver, with instruments, rate limit and urgency."""
     fast = _fast()
     phases = fast.curriculum
     # Soft Actor-Critic has only to find the way around; refinement does the rest.
@@ -126,6 +126,9 @@ def _universal() -> TrainConfig:
             "task": TaskConfig(
                 spread=SpreadConfig(
                     spacecraft=True,
+                    zones=(1, 4),
+                    instruments=3,
+                    keep_in=0.2,
                     step_shares=(0.016, 0.06),
                     # To far above what a maneuver needs: an agent without a limit is at the end of what it knows.
                     max_rate_deg=(2.0, 150.0),
@@ -139,7 +142,10 @@ def _universal() -> TrainConfig:
             "eval_cases": 400,
             "refine_eval_every": 500,
             "network": NetworkConfig(
-                hidden_sizes=(208, 208), encoding=EncodingConfig(rate_scales=(0.016, 0.16)), scaled=True
+                hidden_sizes=(256, 256),
+                encoding=EncodingConfig(rate_scales=(0.016, 0.16)),
+                observed_zones=4,
+                scaled=True,
             ),
             "refine": fast.refine.model_copy(
                 update={

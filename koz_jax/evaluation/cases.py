@@ -23,14 +23,18 @@ from koz_jax.control.shield.filter import under_shield
 from koz_jax.errors import SettingsError
 from koz_jax.evaluation import cautions, rollout
 from koz_jax.evaluation.rollout import CaseResult, History
+from koz_jax.storage import runtime
 from koz_jax.task import maneuver, uncertainty
 from koz_jax.task.any_spacecraft import spread
 from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.environment import Reorientation
 from koz_jax.task.scenario import SamplingRule, Scenario
 
-# Cases that a device flies together: enough to fill the vector units, few enough to stay in its cache.
+# Cases that a core flies together: enough to fill the vector units, few enough to stay in its cache.
 _CHUNK = 500
+
+# The same on a GPU, which takes as long for one case as for thousands.
+_CHUNK_ON_GPU = 100_000
 
 # Separates the draws of the Monte Carlo from those of training with the same seed.
 _PURPOSE = 0x4D43
@@ -126,7 +130,13 @@ def _draw(env: Reorientation, key: jax.Array, case: jax.Array) -> Scenario:
     return _of_case(env, key, case, None).sample(jax.random.fold_in(key, case))
 
 
+def _chunk() -> int:
+    """Cases that a device flies together."""
+    return _CHUNK_ON_GPU if runtime.on_gpu() else _CHUNK
+
+
 @functools.partial(jax.jit, static_argnames="mesh")
+@runtime.in_float32
 def _fly_cases(flight: _Flight, cases: jax.Array, *, mesh: Mesh) -> CaseResult:
     """cases: (devices * n,) int32 indices.  Returns leaves of the same length."""
 
@@ -135,7 +145,7 @@ def _fly_cases(flight: _Flight, cases: jax.Array, *, mesh: Mesh) -> CaseResult:
         return own.evaluate(own.case(case), own.flight_key(case))
 
     def on_one_device(cases: jax.Array) -> CaseResult:
-        return jax.lax.map(one, cases, batch_size=_CHUNK)
+        return jax.lax.map(one, cases, batch_size=_chunk())
 
     over_cases = PartitionSpec("cases")
     sharded = jax.shard_map(on_one_device, mesh=mesh, in_specs=over_cases, out_specs=over_cases, check_vma=False)
@@ -151,8 +161,8 @@ def _arguments(
     # Every device flies equally many cases, in whole chunks where there is more than one: in a chunk of another size
     # numbers are rounded differently.  The surplus is flown and dropped.
     share = -(-config.cases // len(devices))
-    if share > _CHUNK or config.first:
-        share = -(-share // _CHUNK) * _CHUNK
+    if share > _chunk() or (config.first and not runtime.on_gpu()):
+        share = -(-share // _chunk()) * _chunk()
     padded = share * len(devices)
     cases = config.first + jnp.arange(padded, dtype=jnp.int32)
     return (_flight(controller, task, config), cases), {"mesh": Mesh(np.array(devices), ("cases",))}
@@ -166,6 +176,12 @@ def fly_cases(controller: Controller, task: TaskConfig, config: MonteCarloConfig
     """Fly all cases on all local devices.  Returns NumPy leaves (cases,)."""
     traced, static = _arguments(controller, task, config)
     return _to_host(_fly_cases(*traced, **static), config.cases)
+
+
+def compile_flight(controller: Controller, task: TaskConfig, config: MonteCarloConfig) -> object:
+    """Compile what ``fly_cases`` needs.  controller: its arrays, or their shapes alone."""
+    traced, static = _arguments(controller, task, config)
+    return _fly_cases.lower(*traced, **static).compile()
 
 
 def result_shapes(controller: Controller, task: TaskConfig, config: MonteCarloConfig) -> CaseResult:
@@ -227,6 +243,7 @@ def fly_scenario(
 
 
 @jax.jit
+@runtime.in_float32
 def _keep_and_evaluate(flight: _Flight, drawn: Scenario, key: jax.Array) -> tuple[History, CaseResult]:
     return rollout.fly_and_judge(flight.env, flight.controller, drawn, flight.substeps, key)
 

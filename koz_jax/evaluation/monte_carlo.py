@@ -30,10 +30,11 @@ from koz_jax.evaluation import cases, cautions
 from koz_jax.evaluation.cases import Flown
 from koz_jax.evaluation.rollout import CaseResult
 from koz_jax.evaluation.summary import Summary
-from koz_jax.storage import archive, files, processes, pytrees
+from koz_jax.storage import archive, files, processes, pytrees, runtime
 from koz_jax.storage.lock import LOCK, FolderLock
 
 BLOCK = 50_000  # cases
+BLOCK_ON_GPU = 500_000  # cases; of such a block a GPU has the results in a second
 
 _log = logging.getLogger(__name__)
 
@@ -113,7 +114,7 @@ def run_cases(
     config: MonteCarloConfig,
     *,
     partial: Path | None = None,
-    block: int = BLOCK,
+    block: int | None = None,
     progress: bool = True,
 ) -> MonteCarlo:
     """Fly cases as settings say, in blocks.
@@ -124,13 +125,14 @@ def run_cases(
         config: which cases.
         partial: folder for finished blocks; those that are there already are not flown again.  Several processes
             (see ``runtime.join``) need one that all of them see: each flies its share of the blocks.
-        block: cases per block, a multiple of 500.
+        block: cases per block, a multiple of 500; by default what takes seconds to minutes.
         progress: show a progress bar on stderr where there is more than one block.
 
     Raises:
         SettingsError: the folder holds something else, or blocks of another flight.
 
     """
+    block = block or (BLOCK_ON_GPU if runtime.on_gpu() else BLOCK)
     check_feasible(task, config.max_angle_deg)
     cautions.warn_of_task(agent, task, config)
     count = jax.process_count()

@@ -23,6 +23,9 @@ from koz_jax.sac.learner import LearnerState
 from koz_jax.storage import processes
 from koz_jax.task import reward
 
+# How often a program is told to do what it does.
+_COUNT = jax.ShapeDtypeStruct((), jnp.int32)
+
 
 @dataclasses.dataclass(frozen=True)
 class Chunk:
@@ -116,6 +119,10 @@ class Stage(abc.ABC):
         """
 
     @abc.abstractmethod
+    def compile(self, shapes: RunState) -> None:
+        """Compile the program of ``advance`` ahead of it, on one device.  shapes: of the state."""
+
+    @abc.abstractmethod
     def learner(self, state: RunState, devices: int) -> LearnerState:
         """Take what is evaluated out of a state, whole on one device."""
 
@@ -154,6 +161,10 @@ class Learning(Stage):
         }
         return Chunk(state.replace(train=train_state), values, divergence.critic_warning(config, metrics.learner))
 
+    def compile(self, shapes: RunState) -> None:
+        """The same for both phases."""
+        train_step.train_chunk.lower(self.config, shapes.train, _COUNT).compile()
+
     def learner(self, state: RunState, devices: int) -> LearnerState:
         """The learner as it is now."""
         return sharding.on_one_device(state.train.learner, devices)
@@ -185,6 +196,10 @@ class Refinement(Stage):
         parts = {"refine/cost": cost, "refine/state": refined}
         processes.all_or_none(lambda: divergence.check_finite(end, finite_checks.NO_FAULT, parts))
         return Chunk(state.replace(refine=refined), {"refine/cost": float(cost)})
+
+    def compile(self, shapes: RunState) -> None:
+        """That of a gradient step."""
+        refinement.refine_chunk.lower(self.config, shapes.refine, _COUNT).compile()
 
     def learner(self, state: RunState, devices: int) -> LearnerState:
         """The best learner with the refined policy in the place of its own."""

@@ -21,7 +21,7 @@ from koz_jax.errors import SettingsError
 from koz_jax.evaluation import cases
 from koz_jax.evaluation.summary import Summary, summarise
 from koz_jax.learning.finite_checks import NO_FAULT
-from koz_jax.runs import checkpoint, divergence, memory, provenance, sharding, stages
+from koz_jax.runs import ahead, checkpoint, divergence, memory, provenance, sharding, stages
 from koz_jax.runs.checkpoint import Checkpoint, RunState
 from koz_jax.runs.folder import RunFolder
 from koz_jax.runs.interrupt import GracefulShutdown
@@ -34,6 +34,8 @@ from koz_jax.storage.lock import FolderLock
 
 # Evaluation scenarios during training: the same for every run, and drawn from a seed that people do not type.
 _EVAL_SEED = 2_718_281_828
+
+_EVALUATION = "evaluation"
 
 _EVAL_NAMES = ("eval/score", *(f"eval/{name}" for name in Summary.__dataclass_fields__))
 
@@ -78,13 +80,38 @@ def train(
     alike = (config, resume, start_from and str(start_from), devices, version())
     processes.assert_equal_across_processes("settings", alike)
     opening = _resumed(folder, config) if resume else _begun(folder, config, start_from, command)
-    with GracefulShutdown() as shutdown, opening as saved:
+    with ahead.compiling(_programs(config)) as await_program, GracefulShutdown() as shutdown, opening as saved:
         processes.assert_equal_across_processes("checkpoint", (saved.state.done, saved.log))
         shown = progress and processes.is_primary_process()
         with Progress(stages.plan(config), saved.state.done, enabled=shown) as bar:
             bar.note(f"run folder: {folder.path}")
             with memory.exhaustion_in_one_line():
-                return _Run(config, folder, bar, shutdown, devices, command).go(saved)
+                return _Run(config, folder, bar, shutdown, devices, command).go(saved, await_program)
+
+
+def _programs(config: TrainConfig) -> dict[str, ahead.Compile]:
+    """What a run needs after its first program."""
+
+    def evaluation() -> None:
+        policy = checkpoint.template(config).train.learner.averaged_policy
+        cases.compile_flight(PolicyController(policy, config.network), config.task, _drawn(config))
+
+    def of(stage: Stage) -> ahead.Compile:
+        return lambda: stage.compile(checkpoint.template(config))
+
+    # Stages of one kind share a program.
+    return {**{type(stage).__name__: of(stage) for stage in stages.plan(config)}, _EVALUATION: evaluation}
+
+
+def _drawn(config: TrainConfig) -> MonteCarloConfig:
+    """The cases that policies are compared by."""
+    return MonteCarloConfig(
+        cases=config.eval_cases,
+        seed=_EVAL_SEED,
+        min_angle_deg=config.eval_min_angle_deg,
+        max_angle_deg=config.eval_max_angle_deg,
+        shield=config.shielding.in_force,
+    )
 
 
 @contextlib.contextmanager
@@ -167,23 +194,24 @@ class _Run:
         self.provenance = provenance.collect(config, command)
         self.warned = False  # that the critic diverges
 
-    def go(self, saved: Checkpoint) -> Agent | None:
+    def go(self, saved: Checkpoint, await_program: ahead.Await) -> Agent | None:
         """Train to the end, or until asked to stop."""
         state = saved.state
         if stages.after(self.stages, state.done) is not None:
             with RunWriter(self.folder, self.config, saved) as out:
-                state = self._train(state, out)
+                state = self._train(state, out, await_program)
         if stages.after(self.stages, state.done) is not None:
             return None
         return self._best_agent(state, self.stages[-1])
 
-    def _train(self, state: RunState, out: RunWriter) -> RunState:
+    def _train(self, state: RunState, out: RunWriter, await_program: ahead.Await) -> RunState:
         """Go on chunk by chunk; log, evaluate and checkpoint on the way."""
         self.bar.compiling()
         # The first row of a log names its columns.
         blank = dict.fromkeys(("refine/cost", *_EVAL_NAMES), math.nan)
         done = saved_at = state.done
         while (stage := stages.after(self.stages, done)) and not processes.any_process(self.shutdown.requested):
+            await_program(type(stage).__name__)
             start = time.perf_counter()
             chunk = stage.advance(state, self.devices)
             state, before, done = chunk.state, done, chunk.state.done
@@ -193,6 +221,7 @@ class _Run:
             self._warn_once(done, chunk.warning)
             self.bar.advance(done)
             if stage.is_evaluated_at(done):
+                await_program(_EVALUATION)
                 state, evaluated = self._evaluate(state, stage, out)
                 out.row(done, values | evaluated, speed)
                 out.checkpoint(sharding.gather(state))
@@ -236,15 +265,8 @@ class _Run:
 
     def _fly(self, learner: LearnerState, stage: Stage) -> dict[str, float]:
         """Fly the policy; score and summary by the names of their columns."""
-        drawn = MonteCarloConfig(
-            cases=self.config.eval_cases,
-            seed=_EVAL_SEED,
-            min_angle_deg=self.config.eval_min_angle_deg,
-            max_angle_deg=self.config.eval_max_angle_deg,
-            shield=self.config.shielding.in_force,
-        )
         controller = PolicyController(learner.averaged_policy, self.config.network)
-        results = cases.fly_cases(controller, self.config.task, drawn)
+        results = cases.fly_cases(controller, self.config.task, _drawn(self.config))
         summary = summarise(results)
         self.bar.evaluated(summary)
         values = {f"eval/{name}": value for name, value in vars(summary).items()}

@@ -183,9 +183,7 @@ def _pair(key: jax.Array, ranges: ScenarioRanges, q_e: jax.Array, first: Pointin
     return _Pair(boresight_B, jnp.where(kept_in, outside, half_angle), jnp.where(kept_in, -midway_D, midway_D))
 
 
-def _add_zones(
-    key: jax.Array, ranges: ScenarioRanges, q_e: jax.Array, first: PointingConstraint
-) -> PointingConstraint:
+def _add_zones(key: jax.Array, ranges: ScenarioRanges, q_e: jax.Array, first: PointingConstraint) -> PointingConstraint:
     """Put further zones within 90 deg of the first, as many as are drawn and as find a place.
 
     q_e: (4,) attitude at the start, relative to the target; first: leaves (1, ...).  Returns leaves (max_zones, ...).

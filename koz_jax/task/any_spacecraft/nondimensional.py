@@ -38,12 +38,8 @@ def observe(state: EnvState, model: Model, urgency: jax.Array | float, zones: in
         "rate_limit": _rate_limit(largest_rate(state, model), own)[None],
         "urgency": jnp.full(1, 2.0 * urgency - 1.0),
     }
-    for number in range(zones):
-        zone = jax.tree.map(lambda leaf, i=number: leaf[i], nearest)
-        seen = _zone_parts(state, zone, axes)
-        if number:
-            seen["boresight_P"] = jnp.where(zone.is_present, dynamics.matvec(axes, zone.boresight_B), 0.0)
-        parts |= {zone_part(number, name): value for name, value in seen.items()}
+    for name, values in jax.vmap(_zone_parts, in_axes=(None, 0, None))(state.body.q_BN, nearest, axes).items():
+        parts |= {zone_part(number, name): value for number, value in enumerate(values)}
     return jnp.concatenate([parts[name] for name in layout(zones, scaled=True)])
 
 
@@ -71,13 +67,14 @@ def _reach(axes: jax.Array, box_B: jax.Array) -> jax.Array:
     return jnp.min(box_B[None] / jnp.maximum(jnp.abs(axes), 1e-6), axis=1)
 
 
-def _zone_parts(state: EnvState, zone: PointingConstraint, axes: jax.Array) -> dict[str, jax.Array]:
-    q_BN = state.body.q_BN
+def _zone_parts(q_BN: jax.Array, zone: PointingConstraint, axes: jax.Array) -> dict[str, jax.Array]:
     offset = pointing_constraints.axis_B(q_BN, zone) - zone.boresight_B
     distance = rotations.norm(offset)
     angle = pointing_constraints.angle_to_axis(q_BN, zone)
+    boresight_P = dynamics.matvec(axes, zone.boresight_B)
     direction_P = dynamics.matvec(axes, offset / jnp.where(distance > 0.0, distance, 1.0))
     return {
+        "boresight_P": jnp.where(zone.is_present, boresight_P, 0.0),
         "zone_margin": jnp.where(zone.is_present, angle - zone.half_angle, jnp.pi)[None],
         "zone_angle": jnp.where(zone.is_present, angle, jnp.pi)[None],
         "zone_direction_P": jnp.where(zone.is_present, direction_P, 0.0),
