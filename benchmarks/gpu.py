@@ -22,9 +22,9 @@ from speed import best_seconds
 
 from koz_jax.agents.agent import load_agent
 from koz_jax.cli.exit_status import exit_status
-from koz_jax.config import sizes
 from koz_jax.config.monte_carlo import MonteCarloConfig
-from koz_jax.config.presets import preset
+from koz_jax.config.presets import sizes
+from koz_jax.config.presets.named import preset
 from koz_jax.config.training import TrainConfig
 from koz_jax.evaluation.monte_carlo import run_cases
 from koz_jax.learning import refinement, train_step

@@ -20,7 +20,7 @@ import stamp
 
 from koz_jax.agents.agent import Agent, load_agent
 from koz_jax.cli.exit_status import exit_status
-from koz_jax.config.presets import preset
+from koz_jax.config.presets.named import preset
 from koz_jax.config.spread import SpreadConfig
 from koz_jax.config.task import TaskConfig
 from koz_jax.config.training import TrainConfig

@@ -25,7 +25,7 @@ from peer_record import OutOfTimeError, Point, Recorder, rate
 from koz_jax import load_agent
 from koz_jax.adapters.sb3_env import ReorientationVecEnv
 from koz_jax.config.monte_carlo import MonteCarloConfig
-from koz_jax.config.presets import preset
+from koz_jax.config.presets.named import preset
 from koz_jax.config.training import NetworkConfig
 from koz_jax.control.base import Controller
 from koz_jax.evaluation.cases import fly_cases

@@ -83,7 +83,7 @@ def measure(worker: Worker) -> Times:
 
     from koz_jax.agents.agent import load_agent
     from koz_jax.config.monte_carlo import MonteCarloConfig
-    from koz_jax.config.presets import preset
+    from koz_jax.config.presets.named import preset
     from koz_jax.evaluation import cases
     from koz_jax.learning import train_step
     from koz_jax.runs import sharding

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from koz_jax.agents.agent import Agent
 from koz_jax.agents.record import Provenance
 from koz_jax.config.monte_carlo import MonteCarloConfig
-from koz_jax.config.presets import preset
+from koz_jax.config.presets.named import preset
 from koz_jax.config.task import TaskConfig
 from koz_jax.config.training import NetworkConfig
 from koz_jax.control.policy import PolicyController, policy_network

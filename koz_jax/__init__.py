@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from koz_jax.config.maneuvers.maneuver import ManeuverConfig as ManeuverConfig
     from koz_jax.config.maneuvers.maneuver_file import load_maneuver as load_maneuver
     from koz_jax.config.monte_carlo import MonteCarloConfig as MonteCarloConfig
-    from koz_jax.config.presets import preset as preset
+    from koz_jax.config.presets.named import preset as preset
     from koz_jax.config.shield import ShieldConfig as ShieldConfig
     from koz_jax.config.task import ScenarioConfig as ScenarioConfig
     from koz_jax.config.task import SpacecraftConfig as SpacecraftConfig
@@ -50,7 +50,7 @@ _HOME = {
     "UncertaintyConfig": "config.uncertainty",
     "MonteCarloConfig": "config.monte_carlo",
     "TrainConfig": "config.training",
-    "preset": "config.presets",
+    "preset": "config.presets.named",
     "train": "runs.trainer",
     "Agent": "agents.agent",
     "load_agent": "agents.agent",

@@ -33,21 +33,22 @@ IMPORTS: dict[str, set[str]] = structure.imports()
 # Folder (or module beside the folders) -> floor.  Imports go to the same folder, or to a lower floor.
 FLOORS = {
     "errors": 0,
-    "config": 1,
-    "task": 2,
-    "sac": 3,
-    "storage": 4,
-    "control": 5,
-    "learning": 6,
-    "evaluation": 7,
-    "agents": 8,
-    "runs": 9,
-    "adapters": 10,
-    "export": 11,
-    "figures": 12,
-    "viewer": 13,
-    "cli": 14,
-    "koz_jax": 15,  # the public names and ``python -m koz_jax``
+    "devices": 1,
+    "config": 2,
+    "task": 3,
+    "sac": 4,
+    "storage": 5,
+    "control": 6,
+    "learning": 7,
+    "evaluation": 8,
+    "agents": 9,
+    "runs": 10,
+    "adapters": 11,
+    "export": 12,
+    "figures": 13,
+    "viewer": 14,
+    "cli": 15,
+    "koz_jax": 16,  # the public names and ``python -m koz_jax``
 }
 
 # What others import the package for, in the order of its first lines.

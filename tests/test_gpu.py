@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support import tiny
 
+from koz_jax import devices
 from koz_jax.agents.agent import load_agent
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.evaluation import cases
@@ -16,9 +17,8 @@ from koz_jax.evaluation.monte_carlo import monte_carlo
 from koz_jax.learning import refinement, train_step
 from koz_jax.runs.folder import RunFolder
 from koz_jax.runs.trainer import train
-from koz_jax.storage import runtime
 
-pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not runtime.on_gpu(), reason="there is no GPU")]
+pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not devices.on_gpu(), reason="there is no GPU")]
 
 AGENT = load_agent("phase2")
 

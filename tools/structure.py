@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parent.parent / PACKAGE
 # A folder (or a module beside them) imports from itself and from what stands before it.  The last is the package's own
 # face: its ``__init__`` and ``__main__``, which nothing may import.
 FLOORS = (
-    *("errors", "config", "task", "sac", "storage", "control", "learning", "evaluation", "agents", "runs"),
+    *("errors", "devices", "config", "task", "sac", "storage", "control", "learning", "evaluation", "agents", "runs"),
     *("adapters", "export", "figures", "viewer", "cli", PACKAGE),
 )
 

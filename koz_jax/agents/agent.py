@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
+from koz_jax import devices
 from koz_jax.agents import numpy_policy
 from koz_jax.agents.numpy_policy import NumpyPolicy
 from koz_jax.agents.record import Provenance, Record, find_agent, read_agent_record
@@ -19,7 +20,7 @@ from koz_jax.config.spread import SpreadConfig
 from koz_jax.config.task import TaskConfig
 from koz_jax.control.policy import PolicyController, policy_network
 from koz_jax.errors import SettingsError
-from koz_jax.storage import archive, runtime
+from koz_jax.storage import archive
 from koz_jax.task import observation_layout
 from koz_jax.task.observation_layout import as_observations
 
@@ -73,7 +74,7 @@ class Agent:
 
 
 @jax.jit
-@runtime.in_float32
+@devices.in_float32
 def _act(controller: PolicyController, observed: jax.Array) -> jax.Array:
     return controller.act(observed)
 

@@ -159,9 +159,11 @@ class ScaledObserver(Observer):
             "urgency": [2.0 * self._urgency - 1.0],
         }
         for number in range(self._observed_zones):
-            zone = _zone_parts(q_BN, Cones(*(leaf[number] for leaf in nearest)), masked=True)
-            zone["zone_direction_P"] = axes @ zone["zone_direction_B"]
-            parts |= {zone_part(number, name): value for name, value in zone.items()}
+            zone = Cones(*(leaf[number] for leaf in nearest))
+            seen = _zone_parts(q_BN, zone, masked=True)
+            seen["zone_direction_P"] = axes @ seen["zone_direction_B"]
+            seen["boresight_P"] = axes @ zone.boresight_B if zone.half_angle > 0.0 else np.zeros(3)
+            parts |= {zone_part(number, name): value for name, value in seen.items()}
         return np.concatenate([parts[name] for name in layout(self._observed_zones, scaled=True)]).astype(np.float32)
 
 

@@ -18,7 +18,7 @@ from koz_jax.cli.exit_status import exit_status
 from koz_jax.cli.flags import parsing
 from koz_jax.cli.flags.process import ProcessFlags
 from koz_jax.config.base import CaseCount, PositiveInt
-from koz_jax.config.presets import PRESETS, preset
+from koz_jax.config.presets.named import PRESETS, preset
 from koz_jax.config.training import TrainConfig
 from koz_jax.errors import SettingsError
 
@@ -136,10 +136,10 @@ def _train(config: TrainConfig, asked: TrainFlags, command: str) -> int:
 
 def _sized(config: TrainConfig, asked: str) -> TrainConfig:
     """Settings with the sizes that are asked for; says what that changes."""
-    from koz_jax.config import sizes
-    from koz_jax.storage import runtime
+    from koz_jax import devices
+    from koz_jax.config.presets import sizes
 
-    if asked == "cpu" or (asked == "auto" and not runtime.on_gpu()):
+    if asked == "cpu" or (asked == "auto" and not devices.on_gpu()):
         return config
     sized, changed = sizes.for_gpu(config)
     if changed:

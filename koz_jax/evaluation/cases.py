@@ -14,6 +14,7 @@ import numpy as np
 from flax import struct
 from jax.sharding import Mesh, PartitionSpec
 
+from koz_jax import devices
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import TaskConfig, check_feasible
@@ -23,7 +24,6 @@ from koz_jax.control.shield.filter import under_shield
 from koz_jax.errors import SettingsError
 from koz_jax.evaluation import cautions, rollout
 from koz_jax.evaluation.rollout import CaseResult, History
-from koz_jax.storage import runtime
 from koz_jax.task import maneuver, uncertainty
 from koz_jax.task.any_spacecraft import spread
 from koz_jax.task.dynamics import RigidBodyState
@@ -132,11 +132,11 @@ def _draw(env: Reorientation, key: jax.Array, case: jax.Array) -> Scenario:
 
 def _chunk() -> int:
     """Cases that a device flies together."""
-    return _CHUNK_ON_GPU if runtime.on_gpu() else _CHUNK
+    return _CHUNK_ON_GPU if devices.on_gpu() else _CHUNK
 
 
 @functools.partial(jax.jit, static_argnames="mesh")
-@runtime.in_float32
+@devices.in_float32
 def _fly_cases(flight: _Flight, cases: jax.Array, *, mesh: Mesh) -> CaseResult:
     """cases: (devices * n,) int32 indices.  Returns leaves of the same length."""
 
@@ -157,15 +157,15 @@ def _arguments(
 ) -> tuple[tuple[_Flight, jax.Array], dict[str, Any]]:
     """Traced and static arguments of ``_fly_cases``."""
     check_feasible(task, config.max_angle_deg)
-    devices = jax.local_devices()[: config.cases]
+    present = jax.local_devices()[: config.cases]
     # Every device flies equally many cases, in whole chunks where there is more than one: in a chunk of another size
     # numbers are rounded differently.  The surplus is flown and dropped.
-    share = -(-config.cases // len(devices))
-    if share > _chunk() or (config.first and not runtime.on_gpu()):
+    share = -(-config.cases // len(present))
+    if share > _chunk() or (config.first and not devices.on_gpu()):
         share = -(-share // _chunk()) * _chunk()
-    padded = share * len(devices)
+    padded = share * len(present)
     cases = config.first + jnp.arange(padded, dtype=jnp.int32)
-    return (_flight(controller, task, config), cases), {"mesh": Mesh(np.array(devices), ("cases",))}
+    return (_flight(controller, task, config), cases), {"mesh": Mesh(np.array(present), ("cases",))}
 
 
 def _to_host(results: CaseResult, cases: int) -> CaseResult:
@@ -243,7 +243,7 @@ def fly_scenario(
 
 
 @jax.jit
-@runtime.in_float32
+@devices.in_float32
 def _keep_and_evaluate(flight: _Flight, drawn: Scenario, key: jax.Array) -> tuple[History, CaseResult]:
     return rollout.fly_and_judge(flight.env, flight.controller, drawn, flight.substeps, key)
 

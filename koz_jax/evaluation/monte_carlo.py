@@ -20,6 +20,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
+from koz_jax import devices
 from koz_jax.config.base import checked
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.task import TaskConfig, check_feasible, is_paper_task
@@ -30,7 +31,7 @@ from koz_jax.evaluation import cases, cautions
 from koz_jax.evaluation.cases import Flown
 from koz_jax.evaluation.rollout import CaseResult
 from koz_jax.evaluation.summary import Summary
-from koz_jax.storage import archive, files, processes, pytrees, runtime
+from koz_jax.storage import archive, files, processes, pytrees
 from koz_jax.storage.lock import LOCK, FolderLock
 
 BLOCK = 50_000  # cases
@@ -132,7 +133,7 @@ def run_cases(
         SettingsError: the folder holds something else, or blocks of another flight.
 
     """
-    block = block or (BLOCK_ON_GPU if runtime.on_gpu() else BLOCK)
+    block = block or (BLOCK_ON_GPU if devices.on_gpu() else BLOCK)
     check_feasible(task, config.max_angle_deg)
     cautions.warn_of_task(agent, task, config)
     count = jax.process_count()

@@ -9,10 +9,9 @@ import numpy as np
 from koz_jax.agents.numpy_policy import NumpyPolicy, exported_zone_count
 from koz_jax.config.base import Vector
 from koz_jax.config.shield import ShieldConfig
-from koz_jax.config.task import TaskConfig
 from koz_jax.control.shield import brake_path, guide, rate_limit
 from koz_jax.control.shield import filter as shield
-from koz_jax.export import c_network, c_observation, c_text
+from koz_jax.export import c_instruments, c_network, c_observation, c_text
 from koz_jax.export.golden import EXAMPLE_CASE, Golden
 from koz_jax.export.metadata import Metadata, as_text
 from koz_jax.export.shield_golden import ShieldGolden
@@ -34,11 +33,12 @@ _EXAMPLE_ROWS = 20
 def c_files(policy: NumpyPolicy, metadata: Metadata, vectors: Golden, example: np.ndarray) -> dict[str, bytes]:
     """Headers, source, self-test with golden vectors, example, and Makefile, by file name.
 
-    example: (11 + 4 zones,) the situation in which the example's maneuver starts.
+    example: the situation in which the example's maneuver starts, a row as in ``Golden``.
     """
-    network = metadata.network
+    network, instruments = metadata.network, len(metadata.boresights_B)
     replacements = {
         **c_observation.replacements(metadata, vectors),
+        **c_instruments.replacements(instruments),
         "HEAD": _head(metadata),
         "OBSERVATION_SIZE": str(size(network.observed_zones, network.scaled)),
         "ZONES": str(exported_zone_count(network, metadata.task.scenario)),
@@ -50,27 +50,29 @@ def c_files(policy: NumpyPolicy, metadata: Metadata, vectors: Golden, example: n
         "TRAINING_SHA256": metadata.training_sha256,
         "EXPORT_ID": _export_id(metadata),
         "WEIGHTS_SHA256": metadata.weights_sha256,
-        "BORESIGHT": c_text.row(metadata.boresight_B),
+        "BORESIGHT": c_text.of_each([c_text.row(boresight_B) for boresight_B in metadata.boresights_B]),
         "WEIGHTS": c_network.weights(policy),
         "HELPERS": c_network.helpers(policy),
         "DECIDE": c_network.decide(policy),
         "COUNT": str(len(vectors.action)),
         "ACTION_TOLERANCE": _ACTION_TOLERANCE,
         "OBSERVATION_TOLERANCE": _OBSERVATION_TOLERANCE,
-        "SITUATIONS": c_text.situations(vectors.situation),
-        "SITUATION": c_text.situation(example),
-        **_example(metadata.task),
+        "SITUATIONS": c_text.situations(vectors.situation, instruments),
+        "SITUATION": c_text.situation(example, instruments),
+        **_example(metadata),
         "OBSERVATIONS": c_text.rows(vectors.observation),
         "ACTIONS": c_text.rows(vectors.action),
     }
-    return {name: _fill(name, replacements).encode() for name in C_FILES}
+    return {name: _fill(name, replacements, instruments).encode() for name in C_FILES}
 
 
 def shield_files(metadata: Metadata, config: ShieldConfig, vectors: ShieldGolden) -> dict[str, bytes]:
     """Header, source and self-test of a shield for the spacecraft of an exported policy, by file name."""
     model = environment.model_from_config(metadata.task)
     made = shield.from_config(config, model)
+    instruments = len(metadata.boresights_B)
     replacements = {
+        **c_instruments.replacements(instruments),
         "HEAD": _head(metadata),
         "EXPORT_ID": _export_id(metadata),
         "MARGIN_DEG": f"{np.rad2deg(made.margin):.4g}",
@@ -82,18 +84,20 @@ def shield_files(metadata: Metadata, config: ShieldConfig, vectors: ShieldGolden
         "SAMPLES": str(made.brake.samples),
         "COUNT": str(len(vectors.allowed)),
         "TOLERANCE": _TORQUE_TOLERANCE,
-        "SITUATIONS": c_text.situations(vectors.situation),
+        "SITUATIONS": c_text.situations(vectors.situation, instruments),
         "REQUESTED": c_text.rows(vectors.requested),
         "ALLOWED": c_text.rows(vectors.allowed),
         "SAFE": ", ".join(str(int(safe)) for safe in vectors.safe),
         **_shield_constants(made, model, metadata),
     }
-    return {name: _fill(name, replacements).encode() for name in SHIELD_FILES}
+    return {name: _fill(name, replacements, instruments).encode() for name in SHIELD_FILES}
 
 
 def _shield_constants(made: shield.Shield, model: Model, metadata: Metadata) -> dict[str, str]:
     """What the source of a shield holds, by placeholder."""
-    brake, boresight_B = made.brake, jnp.array(metadata.boresight_B)
+    brake = made.brake
+    looks = [pointing_constraints.absent(1, jnp.array(boresight_B)) for boresight_B in metadata.boresights_B]
+    speeds = [float(brake_path.situation(look, model).speed[0]) for look in looks]
     numbers = {
         "MARGIN": made.margin,
         "ATTITUDE_ERROR": made.attitude_error,
@@ -105,7 +109,6 @@ def _shield_constants(made: shield.Shield, model: Model, metadata: Metadata) -> 
         "SOON_STEPS": brake_path.SOON_STEPS,
         "SMALLEST_MOMENT": brake.smallest_moment,
         "LARGEST_MOMENT": brake.largest_moment,
-        "SPEED_PER_MOMENTUM": brake_path.situation(pointing_constraints.absent(1, boresight_B), model).speed[0],
         "GUIDE_RATE": made.guide.rate,
         "GUIDE_SECONDS": made.guide.seconds,
         "GUIDE_TILT": made.guide.tilt,
@@ -123,11 +126,13 @@ def _shield_constants(made: shield.Shield, model: Model, metadata: Metadata) -> 
         **{f"{name}_COUNT": str(len(values)) for name, values in shares.items()},
         **{name: c_text.row(values) for name, values in shares.items()},
         **{name: c_text.number(float(value)) for name, value in numbers.items()},
+        "SPEED_PER_MOMENTUM": c_text.number(speeds[0]) if len(speeds) == 1 else c_text.braced(speeds),
     }
 
 
-def _example(task: TaskConfig) -> dict[str, str]:
+def _example(metadata: Metadata) -> dict[str, str]:
     """The rigid body of the example, in double precision, and how long it flies."""
+    task = metadata.task
     inertia = np.array(task.spacecraft.inertia)
     settled_deg = task.reward.settled_angle_deg / (1.0 if task.angle_convention == "full" else 0.5)
     exact = {"INERTIA": inertia, "INVERSE_INERTIA": np.linalg.inv(inertia)}
@@ -136,7 +141,7 @@ def _example(task: TaskConfig) -> dict[str, str]:
         "STEPS": str(task.episode_steps),
         "ROW_STEPS": str(max(1, task.episode_steps // _EXAMPLE_ROWS)),
         "SETTLED_DEG": repr(float(settled_deg)),
-        "EXACT_BORESIGHT": c_text.exact_row(task.spacecraft.boresight),
+        "EXACT_BORESIGHT": c_text.of_each([c_text.exact_row(boresight_B) for boresight_B in metadata.boresights_B]),
         **{f"EXACT_{name}": ", ".join(f"{{{c_text.exact_row(row)}}}" for row in rows) for name, rows in exact.items()},
     }
 
@@ -169,6 +174,7 @@ def _export_id(metadata: Metadata) -> str:
     if metadata.scaling is None:
         return f"0x{metadata.training_sha256[:8]}"
     content = metadata.training_sha256 + metadata.task.model_dump_json()
+    content += "".join(instrument.model_dump_json() for instrument in metadata.further_instruments)
     return f"0x{hashlib.sha256(content.encode()).hexdigest()[:8]}"
 
 
@@ -176,8 +182,8 @@ def _head(metadata: Metadata) -> str:
     return "\n".join(f" * {line}".rstrip() for line in as_text(metadata).splitlines())
 
 
-def _fill(name: str, replacements: dict[str, str]) -> str:
+def _fill(name: str, replacements: dict[str, str], instruments: int) -> str:
     text = (importlib.resources.files("koz_jax.export") / "templates" / name).read_text(encoding="utf-8")
     for key, value in replacements.items():
         text = text.replace(f"@{key}@", value)
-    return text
+    return c_instruments.lines_for(text, instruments)

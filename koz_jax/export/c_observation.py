@@ -1,8 +1,11 @@
 """What the C source holds of observation, urgency and torque, by placeholder of the templates.
 
 A policy of one spacecraft sees the paper's observation and commands shares of the torque limits.  One for any
-spacecraft is exported for one of them: its units, axes and features are constants, and the urgency is a setting.
+spacecraft is exported for one of them: its units, axes and features are constants, and the urgency is a setting.  Where
+that has several instruments, there is a set of them for each.
 """
+
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -26,6 +29,7 @@ _OF_ONE = {
     "ZONE_PLACE": "(place == 0 ? 10 : 11 + 5 * place)",
     "ZONE_DIRECTION": "        zone_direction(&unit, nearest, part + 2);\n",
     "WHICH_ABSENT": "place > 0 && ",
+    "ABSENT_BORESIGHT": "",
     "OBSERVE_SPACECRAFT": "",
     "TORQUE": """    int i;
     koz_decide(observation, torque_B);
@@ -46,23 +50,18 @@ _OF_ANY = {
 
 """,
     "MEMORY_FIELD": """    float urgency; /* from 0 to 1, yours to set at any time after koz_start */
+@SEVERAL@    int instrument; /* that of the nearest zone, whose axes are the policy's */
 """,
-    "MEMORY_START": ", (float)(KOZ_URGENCY)",
-    "SPACECRAFT": """static const float policy_axes[3][3] = {@AXES@}; /* rows in body components */
-static const float rate_to_policy[3][3] = {@RATE_TO_POLICY@}; /* [s] the same times T */
-static const float constant_parts[@SEEN_COUNT@] = {@SEEN@}; /* @SEEN_NAMES@ */
-static const float torque_per_action[3][3] = {@TORQUE_PER_ACTION@}; /* [N m] */
+    "MEMORY_START": ", (float)(KOZ_URGENCY)@NO_INSTRUMENT@",
+    "SPACECRAFT": """static const float policy_axes@OF_INSTRUMENTS@[3][3] = {@AXES@}; /* rows in body components */
+static const float rate_to_policy@OF_INSTRUMENTS@[3][3] = {@RATE_TO_POLICY@}; /* [s] the same times T */
+static const float constant_parts@OF_INSTRUMENTS@[@SEEN_COUNT@] = {@SEEN@}; /* @SEEN_NAMES@ */
+static const float torque_per_action@OF_INSTRUMENTS@[3][3] = {@TORQUE_PER_ACTION@}; /* [N m] */
 
 static void multiply(const float m[3][3], const float v[3], float product[3])
 {
     int i;
     for (i = 0; i < 3; i++) product[i] = koz_dot(m[i], v);
-}
-
-static void to_policy_axes(float v[3])
-{
-    const float v_B[3] = {v[0], v[1], v[2]};
-    multiply(policy_axes, v_B, v);
 }
 
 static float usable(float urgency)
@@ -72,24 +71,26 @@ static float usable(float urgency)
 }
 
 """,
-    "OBSERVE_BODY": """    remember(memory, &unit);
-    observation[0] = memory->q_e[0];
-    multiply(policy_axes, memory->q_e + 1, observation + 1);
-    multiply(rate_to_policy, unit.omega_BN_B, observation + 4);
+    "OBSERVE_BODY": """    float direction_B[3];
+    remember(memory, &unit);
 """,
-    "ZONE_PLACE": "7 + 5 * place",
-    "ZONE_DIRECTION": """        zone_direction(&unit, nearest, part + 2);
-        to_policy_axes(part + 2);
-""",
+    # The boresight stands before the margin, and only of zones after the first.
+    "ZONE_PLACE": "7 + 8 * place",
+    "ZONE_DIRECTION": """@SEVERAL@        if (place == 0) memory->instrument = unit.zone_instrument[nearest];
+        zone_direction(&unit, nearest, direction_B);
+        multiply(policy_axes@OF_MEMORY@, direction_B, part + 2);
+@FURTHER_ZONE@""",
     "WHICH_ABSENT": "",
-    "OBSERVE_SPACECRAFT": """    for (i = 0; i < @SEEN_COUNT@; i++)
-        observation[7 + 5 * KOZ_OBSERVED_ZONES + i] = constant_parts[i];
+    "OBSERVE_SPACECRAFT": """    observation[0] = memory->q_e[0];
+    multiply(policy_axes@OF_MEMORY@, memory->q_e + 1, observation + 1);
+    multiply(rate_to_policy@OF_MEMORY@, unit.omega_BN_B, observation + 4);
+    for (i = 0; i < @SEEN_COUNT@; i++) observation[4 + 8 * KOZ_OBSERVED_ZONES + i] = constant_parts@OF_MEMORY@[i];
     observation[KOZ_OBSERVATION_SIZE - 1] = 2.0f * usable(memory->urgency) - 1.0f;
 """,
     "TORQUE": """    float action[KOZ_ACTION_SIZE];
     int i;
     koz_decide(observation, action);
-    multiply(torque_per_action, action, torque_B);
+    multiply(torque_per_action@OF_GIVEN_MEMORY@, action, torque_B);
     for (i = 0; i < KOZ_ACTION_SIZE; i++) {
         const float limit = @LIMIT_OF_I@;
         torque_B[i] = torque_B[i] > limit ? limit : torque_B[i] < -limit ? -limit : torque_B[i];
@@ -105,27 +106,45 @@ static const float torques[COUNT][KOZ_ACTION_SIZE] = {
 """,
 }
 
+# Of a policy for any spacecraft that sees several zones.
+_FURTHER = {
+    "FURTHER_ZONE": """        if (place > 0)
+            multiply(policy_axes@OF_MEMORY@, koz_boresight_B@OF_NEAREST@, part - 3);
+""",
+    "ABSENT_BORESIGHT": """            if (place > 0) part[-3] = part[-2] = part[-1] = 0.0f;
+""",
+}
+
 
 def replacements(metadata: Metadata, vectors: Golden) -> dict[str, str]:
     """Text by placeholder; that of the first ones holds others, which come after them."""
     if metadata.scaling is None:
         return _OF_ONE | {"MEMORIES": ",\n".join(f"    {{{c_text.braced(q_e)}}}" for q_e in vectors.memory)}
-    memories = (f"    {{{c_text.braced(each[:4])}, {c_text.number(each[4])}}}" for each in vectors.memory)
-    return _OF_ANY | {
-        "MEMORIES": ",\n".join(memories),
-        "TORQUE_ROWS": c_text.rows(vectors.torque),
-        **_constants(metadata.scaling),
-    }
+    starts = ((c_text.braced(each[:4]), c_text.number(each[4])) for each in vectors.memory)
+    memories = (f"    {{{q_e}, {urgency}@NO_INSTRUMENT@}}" for q_e, urgency in starts)
+    scalings = [metadata.scaling, *(instrument.scaling for instrument in metadata.further_instruments)]
+    further = _FURTHER if metadata.network.observed_zones > 1 else dict.fromkeys(_FURTHER, "")
+    numbers = {"MEMORIES": ",\n".join(memories), "TORQUE_ROWS": c_text.rows(vectors.torque)}
+    return _OF_ANY | further | numbers | _constants(scalings)
 
 
-def _constants(scaling: Scaling) -> dict[str, str]:
-    seen = [value for values in scaling.seen.values() for value in values]
+def _constants(scalings: Sequence[Scaling]) -> dict[str, str]:
+    """Those of each instrument."""
+    own = scalings[0]
+
+    def each(text: Callable[[Scaling], str]) -> str:
+        return c_text.of_each([text(scaling) for scaling in scalings])
+
     return {
-        "URGENCY": c_text.number(scaling.urgency),
-        "AXES": c_text.matrix(scaling.axes),
-        "RATE_TO_POLICY": c_text.matrix(scaling.time_unit * np.array(scaling.axes)),
-        "SEEN_COUNT": str(len(seen)),
-        "SEEN_NAMES": ", ".join(scaling.seen),
-        "SEEN": c_text.row(seen),
-        "TORQUE_PER_ACTION": c_text.matrix(scaling.torque_per_action),
+        "URGENCY": c_text.number(own.urgency),
+        "AXES": each(lambda scaling: c_text.matrix(scaling.axes)),
+        "RATE_TO_POLICY": each(lambda scaling: c_text.matrix(scaling.time_unit * np.array(scaling.axes))),
+        "SEEN_COUNT": str(len(_seen(own))),
+        "SEEN_NAMES": ", ".join(own.seen),
+        "SEEN": each(lambda scaling: c_text.row(_seen(scaling))),
+        "TORQUE_PER_ACTION": each(lambda scaling: c_text.matrix(scaling.torque_per_action)),
     }
+
+
+def _seen(scaling: Scaling) -> list[float]:
+    return [value for values in scaling.seen.values() for value in values]

@@ -1,6 +1,6 @@
 """Numbers, tables and situations as C99 source."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,15 +36,22 @@ def matrix(table: ArrayLike) -> str:
     return ", ".join(braced(each) for each in np.asarray(table))
 
 
-def situations(table: np.ndarray) -> str:
-    """Initialisers of ``koz_situation``.  table: (n, 11 + 4 zones)."""
-    return ",\n".join(f"    {situation(each)}" for each in table)
+def of_each(texts: Sequence[str]) -> str:
+    """Initialisers of what every instrument has: of one itself, of several one in braces for each."""
+    return texts[0] if len(texts) == 1 else ", ".join(f"{{{text}}}" for text in texts)
 
 
-def situation(values: np.ndarray) -> str:
-    """Initialiser of a ``koz_situation``.  values: (11 + 4 zones,)."""
-    zones = (len(values) - 11) // 4
-    q_BN, omega, q_DN, axes, half_angles = np.split(values, np.cumsum([4, 3, 4, 3 * zones]))
+def situations(table: np.ndarray, instruments: int) -> str:
+    """Initialisers of ``koz_situation``.  table: (n, 11 + 4 zones), of several instruments (n, 11 + 5 zones)."""
+    return ",\n".join(f"    {situation(each, instruments)}" for each in table)
+
+
+def situation(values: np.ndarray, instruments: int) -> str:
+    """Initialiser of a ``koz_situation``.  values: (11 + 4 zones,), of several instruments (11 + 5 zones,)."""
+    zones = (len(values) - 11) // (4 if instruments == 1 else 5)
+    parts = np.split(values, np.cumsum([4, 3, 4, 3 * zones, zones]))
+    q_BN, omega, q_DN, axes, half_angles, numbers = parts
     attitude = ", ".join(braced(part) for part in (q_BN, omega, q_DN))
     axis_rows = ", ".join(braced(axis) for axis in axes.reshape(zones, 3))
-    return f"{{{attitude}, {{{axis_rows}}}, {braced(half_angles)}}}"
+    which = "" if instruments == 1 else f", {{{', '.join(str(int(number)) for number in numbers)}}}"
+    return f"{{{attitude}, {{{axis_rows}}}, {braced(half_angles)}{which}}}"

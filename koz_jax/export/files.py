@@ -1,11 +1,12 @@
 """Exports as files: what an agent becomes in each format, and how that replaces an earlier export."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
 from koz_jax.agents.agent import Agent
+from koz_jax.config.base import Vector
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.spread import SpreadConfig
 from koz_jax.config.task import TaskConfig
@@ -15,6 +16,7 @@ from koz_jax.export.golden import example, golden
 from koz_jax.export.metadata import describe
 from koz_jax.export.shield_golden import shield_golden
 from koz_jax.storage import files
+from koz_jax.task import host
 
 GOLDEN_VECTORS = 100
 
@@ -24,6 +26,7 @@ def export(
     to: Literal["c", "onnx", "stablehlo"],
     shield: ShieldConfig | None = None,
     task: TaskConfig | None = None,
+    further_boresights: Sequence[Vector] = (),
 ) -> dict[str, bytes]:
     """Contents of the exported files by their names.
 
@@ -32,15 +35,19 @@ def export(
         to: format.
         shield: of C only; None leaves it out.
         task: of an agent for any spacecraft, with the one that it is exported for; see ``made_for``.
+        further_boresights: of an agent for any spacecraft, unit vectors (3,) in body axes of the instruments 1, 2, ...,
+            such as of ``load_spacecraft(path).instruments[1:]``; of C only.  Number 0 is the task's own.
 
     Raises:
         MissingExtraError: a package that the format needs is not installed.
-        SettingsError: the shield cannot be, or the agent is of one spacecraft and is asked to fly another.
+        SettingsError: the shield cannot be, or the agent is of one spacecraft and is asked to fly another, or with
+            several instruments; or these are no unit vectors, or the format is not C.
 
     """
     made = made_for(agent, task)
     policy = agent.to_numpy()
-    metadata = describe(policy, made.task, float(agent.controller.urgency))
+    further = _checked(further_boresights, to)
+    metadata = describe(policy, made.task, float(agent.controller.urgency), further)
     # What only one format needs is imported for that format.
     if to == "onnx":
         from koz_jax.export.onnx import onnx_files
@@ -50,10 +57,12 @@ def export(
         from koz_jax.export.stablehlo import stablehlo_files
 
         return stablehlo_files(agent, metadata)
-    contents = c_files(policy, metadata, golden(made, GOLDEN_VECTORS), example(made))
+    vectors = golden(made, GOLDEN_VECTORS, further_boresights=further)
+    contents = c_files(policy, metadata, vectors, example(made, bool(further)))
     if shield is None:
         return contents
-    return contents | shield_files(metadata, shield, shield_golden(made, shield, GOLDEN_VECTORS))
+    answers = shield_golden(made, shield, GOLDEN_VECTORS, further_boresights=further)
+    return contents | shield_files(metadata, shield, answers)
 
 
 def made_for(agent: Agent, task: TaskConfig | None = None) -> Agent:
@@ -76,6 +85,16 @@ def made_for(agent: Agent, task: TaskConfig | None = None) -> Agent:
     zones = agent.task.scenario.model_copy(update={"max_rate_deg": own.scenario.max_rate_deg})
     one = own.model_copy(update={"spread": SpreadConfig(), "scenario": zones})
     return dataclasses.replace(agent, task=one)
+
+
+def _checked(further_boresights: Sequence[Vector], to: str) -> tuple[Vector, ...]:
+    if further_boresights and to != "c":
+        raise SettingsError(
+            f"further_boresights: zones of several instruments are known to exports to C only so far, got"
+            f" {len(further_boresights)} for {to}"
+        )
+    units = (host.unit(f"further_boresights[{n}]", each, 3) for n, each in enumerate(further_boresights))
+    return tuple((float(x), float(y), float(z)) for x, y, z in units)
 
 
 def write_files(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:

@@ -1,6 +1,7 @@
 """Golden vectors: situations all over the flight envelope, with what the core observes and the agent decides there."""
 
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -10,6 +11,7 @@ from flax import struct
 
 from koz_jax.agents.agent import Agent
 from koz_jax.agents.numpy_policy import exported_zone_count
+from koz_jax.config.base import Vector
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.training import NetworkConfig
 from koz_jax.evaluation.cases import draw_case
@@ -36,43 +38,55 @@ class Situation(struct.PyTreeNode):
     q_DN: jax.Array  # (4,) target
     zone_axis_N: jax.Array  # (zones, 3) unit vectors
     zone_half_angle: jax.Array  # (zones,) [rad]
+    zone_instrument: jax.Array | None = None  # (zones,) int32, number of each zone's; None where there is one
 
-    def state(self, model: Model, boresight_B: jax.Array) -> EnvState:
-        """The core's own state, as at a start.  boresight_B: (3,) of the instrument that the zones are for."""
-        boresights_B = jnp.tile(boresight_B, (len(self.zone_half_angle), 1))
-        zones = PointingConstraint(boresights_B, self.zone_axis_N, self.zone_half_angle)
+    def state(self, model: Model, boresights_B: jax.Array) -> EnvState:
+        """The core's own state, as at a start.  boresights_B: (3,), or of several instruments (n, 3)."""
+        if self.zone_instrument is None:
+            looks_B = jnp.tile(boresights_B, (len(self.zone_half_angle), 1))
+        else:
+            looks_B = boresights_B[self.zone_instrument]
+        zones = PointingConstraint(looks_B, self.zone_axis_N, self.zone_half_angle)
         return state.begin(Scenario(RigidBodyState(self.q_BN, self.omega_BN_B), self.q_DN, zones), model)
 
 
 class Golden(NamedTuple):
     """Situations and the answers to them; float32, leading axis (count,)."""
 
-    situation: np.ndarray  # (count, 11 + 4 zones), the fields of ``Situation`` side by side; attitudes of either sign
+    situation: np.ndarray  # (count, 11 + 4 zones), of several instruments (count, 11 + 5 zones): the fields of
+    # ``Situation`` side by side; attitudes of either sign
     memory: np.ndarray  # (count, 4) q_e one step ago, of the sign that is continuous with the observation's; (count, 5)
-    # with the urgency where the policy sees one
+    # with the urgency where the policy sees one; (count, 6) and an instrument, 0, where there are several
     observation: np.ndarray  # (count, entries)
     action: np.ndarray  # (count, 3)
     torque: np.ndarray  # (count, 3) [N m] body axes
 
 
-def golden(agent: Agent, count: int, seed: int = 0) -> Golden:
-    """Draw situations, and urgencies where the policy sees one, and answer them."""
-    drawn = situations(agent, count, seed)
-    model, boresight_B = known(agent)
+def golden(agent: Agent, count: int, seed: int = 0, further_boresights: Sequence[Vector] = ()) -> Golden:
+    """Draw situations, and urgencies where the policy sees one, and answer them.
+
+    further_boresights: unit vectors (3,) in body axes, of instruments beside the task's own.
+    """
+    drawn = situations(agent, count, seed, 1 + len(further_boresights))
+    model, boresights_B = known(agent, further_boresights)
     network = agent.controller.network
     rng = np.random.default_rng(seed)
     # Sensors may hand over either sign, and what is observed stays the same.
     sign = rng.choice([-1.0, 1.0], (count, 1)).astype(np.float32)
     urgency = rng.uniform(size=(count, 1)).astype(np.float32)
-    memory, observed = map(np.asarray, _observe(drawn, urgency[:, 0], model, boresight_B, network))
+    memory, observed = map(np.asarray, _observe(drawn, urgency[:, 0], model, boresights_B, network))
     action = agent.predict(observed)
-    torque = np.asarray(_torque(drawn, action, model, boresight_B, network))
+    torque = np.asarray(_torque(drawn, action, model, boresights_B, network))
     memory = np.concatenate([memory, urgency], axis=1) if network.scaled else memory
+    memory = np.pad(memory, ((0, 0), (0, 1))) if further_boresights else memory
     return Golden(rows(drawn.replace(q_BN=sign * drawn.q_BN)), memory, observed, action, torque)
 
 
-def example(agent: Agent) -> np.ndarray:
-    """Where the maneuver of the exported example starts.  Returns (11 + 4 zones,) float32, as in ``Golden``."""
+def example(agent: Agent, several: bool = False) -> np.ndarray:
+    """Where the maneuver of the exported example starts; its zones are for instrument 0, also of several.
+
+    Returns (11 + 4 zones,) float32, of several instruments (11 + 5 zones,), as in ``Golden``.
+    """
     drawn = draw_case(agent.task, MonteCarloConfig(), EXAMPLE_CASE)
     zones = drawn.constraints
     missing = exported_zone_count(agent.controller.network, agent.task.scenario) - zones.count
@@ -82,21 +96,27 @@ def example(agent: Agent) -> np.ndarray:
         q_DN=drawn.q_DN,
         zone_axis_N=jnp.concatenate([zones.axis_N, jnp.tile(jnp.array([1.0, 0.0, 0.0]), (missing, 1))]),
         zone_half_angle=jnp.concatenate([zones.half_angle, jnp.full(missing, ABSENT_HALF_ANGLE)]),
+        zone_instrument=jnp.zeros(zones.count + missing, jnp.int32) if several else None,
     )
     return rows(jax.tree.map(lambda leaf: leaf[None], start))[0]
 
 
 def rows(drawn: Situation) -> np.ndarray:
-    """Fields of situations with a leading axis (count,) as columns.  Returns (count, 11 + 4 zones) float32."""
-    return np.concatenate([np.reshape(leaf, (len(leaf), -1)) for leaf in jax.tree.leaves(drawn)], axis=1)
+    """Fields of situations with a leading axis (count,) as columns.
+
+    Returns (count, 11 + 4 zones) float32, of several instruments (count, 11 + 5 zones).
+    """
+    columns = [np.reshape(leaf, (len(leaf), -1)) for leaf in jax.tree.leaves(drawn)]
+    return np.concatenate(columns, axis=1, dtype=np.float32)
 
 
-def situations(agent: Agent, count: int, seed: int = 0) -> Situation:
+def situations(agent: Agent, count: int, seed: int = 0, instruments: int = 1) -> Situation:
     """Draw situations.  Returns leaves (count, ...).
 
     Angles to the target and rates are spread evenly over the orders of magnitude between resting on the target and
     turning towards it from the other side; targets and zones are anywhere, and some zones after the first are absent.
-    For a policy for any spacecraft, rates are those of the paper's in units of its own.
+    For a policy for any spacecraft, rates are those of the paper's in units of its own, and zones are for one of its
+    instruments each.
     """
     rng = np.random.default_rng(seed)
     limits = agent.task.scenario
@@ -113,6 +133,7 @@ def situations(agent: Agent, count: int, seed: int = 0) -> Situation:
         q_DN=q_DN,
         zone_axis_N=directions(rng, count * zones, 3).reshape(count, zones, 3),
         zone_half_angle=jnp.float32(half_angle),
+        zone_instrument=jnp.int32(rng.integers(instruments, size=(count, zones))) if instruments > 1 else None,
     )
 
 
@@ -122,19 +143,21 @@ def directions(rng: np.random.Generator, count: int, size: int) -> jax.Array:
     return jnp.float32(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
-def known(agent: Agent) -> tuple[Model, jax.Array]:
-    """Spacecraft of an agent, and the telescope (3,) in its body axes."""
-    return environment.model_from_config(agent.task), jnp.array(agent.task.spacecraft.boresight)
+def known(agent: Agent, further_boresights: Sequence[Vector] = ()) -> tuple[Model, jax.Array]:
+    """Spacecraft of an agent, and the telescope (3,) in its body axes; of several instruments all, (n, 3)."""
+    own = agent.task.spacecraft.boresight
+    boresights_B = jnp.array([own, *further_boresights] if further_boresights else own)
+    return environment.model_from_config(agent.task), boresights_B
 
 
 @functools.partial(jax.jit, static_argnames="network")
 def _observe(
-    drawn: Situation, urgency: jax.Array, model: Model, boresight_B: jax.Array, network: NetworkConfig
+    drawn: Situation, urgency: jax.Array, model: Model, boresights_B: jax.Array, network: NetworkConfig
 ) -> tuple[jax.Array, jax.Array]:
     """Attitude errors one step ago, at the same rate, and what is observed now; leading axis (count,)."""
 
     def one(situation: Situation, urgency: jax.Array) -> tuple[jax.Array, jax.Array]:
-        now = situation.state(model, boresight_B)
+        now = situation.state(model, boresights_B)
         turned = model.dt * situation.omega_BN_B
         angle = rotations.norm(turned)
         back = rotations.from_axis_angle(turned / jnp.where(angle > 0.0, angle, 1.0), -angle)
@@ -149,12 +172,12 @@ def _observe(
 
 @functools.partial(jax.jit, static_argnames="network")
 def _torque(
-    drawn: Situation, action: jax.Array, model: Model, boresight_B: jax.Array, network: NetworkConfig
+    drawn: Situation, action: jax.Array, model: Model, boresights_B: jax.Array, network: NetworkConfig
 ) -> jax.Array:
     """What actuators make of actions (count, 3) in these situations.  Returns (count, 3) [N m]."""
 
     def one(situation: Situation, action: jax.Array) -> jax.Array:
-        at = situation.state(model, boresight_B)
+        at = situation.state(model, boresights_B)
         command = nondimensional.command(action, at, model) if network.scaled else action
         return model.actuators.apply(command, at.actuators, at.body.omega_BN_B, model.inertia_B, model.dt)[0]
 

@@ -44,10 +44,11 @@ class CLibrary:
         self.zones, self._observation_size = (
             int(re.findall(rf"#define {name} (\d+)", header)[0]) for name in ("KOZ_ZONES", "KOZ_OBSERVATION_SIZE")
         )
-        self._situation_size = 11 + 4 * self.zones
-        # q_e, and an urgency where the policy sees one.
-        self._memory_size = 5 if "#define KOZ_URGENCY" in header else 4
-        for name, pointers in (("start", 2), ("observe", 3), ("decide", 2), ("torque", 2)):
+        self._several = "#define KOZ_INSTRUMENTS" in header
+        self._situation_size = 11 + (5 if self._several else 4) * self.zones
+        # q_e, an urgency where the policy sees one, and which instrument where there are several.
+        self._memory_size = 4 + ("#define KOZ_URGENCY" in header) + self._several
+        for name, pointers in (("start", 2), ("observe", 3), ("decide", 2), ("torque", 3 if self._several else 2)):
             getattr(self._functions, f"koz_{name}").argtypes = (ctypes.c_void_p,) * pointers
             getattr(self._functions, f"koz_{name}").restype = None
         self._functions.koz_fault.argtypes = (ctypes.c_void_p,)
@@ -58,40 +59,57 @@ class CLibrary:
             self._functions.koz_shield.restype = None
 
     def faults(self, situations: np.ndarray) -> list[str | None]:
-        """What is wrong with each situation (batch, 11 + 4 zones): ``koz_situation`` field by field; None: nothing."""
-        told = _rows_of("situations", situations, self._situation_size)
+        """What is wrong with each situation (batch, 11 + 4 zones): ``koz_situation`` field by field; None: nothing.
+
+        Of several instruments (batch, 11 + 5 zones), here and below: the number of each zone's comes last.
+        """
+        told = self._situations(situations)
         found = [self._functions.koz_fault(row.ctypes.data) for row in told]
         return [None if fault is None else fault.decode() for fault in found]
 
     def start(self, situations: np.ndarray) -> np.ndarray:
         """Begin maneuvers in these situations (batch, 11 + 4 zones).
 
-        Returns memories (batch, 4) for ``observe``; of a policy for any spacecraft (batch, 5), the last its urgency.
+        Returns memories (batch, 4) for ``observe``; of a policy for any spacecraft (batch, 5), the last its urgency; of
+        several instruments (batch, 6), the last the number of the nearest zone's.
         """
-        told = _rows_of("situations", situations, self._situation_size)
+        told = self._situations(situations)
         memories = np.empty((len(told), self._memory_size), np.float32)
         self._each("koz_start", memories, told)
-        return memories
+        return self._told(memories)
 
     def observe(self, situations: np.ndarray, memories: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Observations (batch, entries) of situations (batch, 11 + 4 zones), and the memories from then on.
 
         situations: ``koz_situation`` field by field; memories: of ``start``, or of the step before.
         """
-        told = _rows_of("situations", situations, self._situation_size)
-        kept = _rows_of("memories", memories, self._memory_size).copy()
+        told = self._situations(situations)
+        kept = self._memories(memories).copy()
         _check_as_many("memories", kept, told)
         observations = np.empty((len(told), self._observation_size), np.float32)
         self._each("koz_observe", kept, told, observations)
-        return observations, kept
+        return observations, self._told(kept)
 
     def decide(self, observations: np.ndarray) -> np.ndarray:
         """Actions (batch, 3) in [-1, 1] for observations (batch, entries)."""
         return self._answer("koz_decide", observations)
 
-    def torque(self, observations: np.ndarray) -> np.ndarray:
-        """Torques (batch, 3) [N m] in body axes for observations (batch, entries)."""
-        return self._answer("koz_torque", observations)
+    def torque(self, observations: np.ndarray, memories: np.ndarray | None = None) -> np.ndarray:
+        """Torques (batch, 3) [N m] in body axes for observations (batch, entries).
+
+        memories: of several instruments, as ``observe`` returned them with the observations.
+
+        Raises:
+            SettingsError: there are several instruments and no memories, or an input has another shape.
+
+        """
+        if not self._several:
+            return self._answer("koz_torque", observations)
+        if memories is None:
+            raise SettingsError("memories: must be those of the observations where there are several instruments")
+        kept = self._memories(memories)
+        _check_as_many("memories", kept, observations, "observations")
+        return self._answer("koz_torque", observations, kept)
 
     def shield(self, situations: np.ndarray, torques: np.ndarray) -> np.ndarray:
         """Torques (batch, 3) [N m] that the shield allows in place of the requested ones.
@@ -102,18 +120,30 @@ class CLibrary:
         """
         if not self.has_shield:
             raise SettingsError("shield: this controller was exported without; --shield exports it")
-        told = _rows_of("situations", situations, self._situation_size)
+        told = self._situations(situations)
         requested = _rows_of("torques", torques, ACTION_SIZE)
         _check_as_many("torques", requested, told)
         allowed = np.empty_like(requested)
         self._each("koz_shield", told, requested, allowed)
         return allowed
 
-    def _answer(self, name: str, observations: np.ndarray) -> np.ndarray:
+    def _answer(self, name: str, observations: np.ndarray, *before: np.ndarray) -> np.ndarray:
         asked = _rows_of("observations", observations, self._observation_size)
         answers = np.empty((len(asked), ACTION_SIZE), np.float32)
-        self._each(name, asked, answers)
+        self._each(name, *before, asked, answers)
         return answers
+
+    def _situations(self, given: np.ndarray) -> np.ndarray:
+        return _rows_of("situations", given, self._situation_size, self.zones if self._several else 0)
+
+    def _memories(self, given: np.ndarray) -> np.ndarray:
+        return _rows_of("memories", given, self._memory_size, int(self._several))
+
+    def _told(self, memories: np.ndarray) -> np.ndarray:
+        """Memories of C as plain numbers."""
+        if self._several:
+            memories[:, -1:] = memories[:, -1:].copy().view(np.int32)
+        return memories
 
     def _each(self, name: str, *tables: np.ndarray) -> None:
         """Call a function for each row of some tables."""
@@ -124,14 +154,16 @@ class CLibrary:
             function(*(start + index * stride for start, stride in places))
 
 
-def _rows_of(name: str, given: np.ndarray, entries: int) -> np.ndarray:
-    """Rows as C reads them; one that is too short would be read beyond its end."""
+def _rows_of(name: str, given: np.ndarray, entries: int, integers: int = 0) -> np.ndarray:
+    """Rows as C reads them, the last entries as int; one that is too short would be read beyond its end."""
     rows = np.ascontiguousarray(given, np.float32)
     if rows.ndim != 2 or rows.shape[1] != entries:
         raise SettingsError(f"{name}: must have shape (batch, {entries}), got {rows.shape}")
+    if integers:
+        rows = np.concatenate([rows[:, :-integers], rows[:, -integers:].astype(np.int32).view(np.float32)], axis=1)
     return rows
 
 
-def _check_as_many(name: str, given: np.ndarray, situations: np.ndarray) -> None:
-    if len(given) != len(situations):
-        raise SettingsError(f"{name}: must be one for each of {len(situations)} situations, got {len(given)}")
+def _check_as_many(name: str, given: np.ndarray, others: np.ndarray, what: str = "situations") -> None:
+    if len(given) != len(others):
+        raise SettingsError(f"{name}: must be one for each of {len(others)} {what}, got {len(given)}")

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from koz_jax.agents.numpy_policy import NumpyPolicy
 from koz_jax.agents.record import Provenance, Record
@@ -52,6 +52,13 @@ class Scaling(Settings):
     minus 1."""
 
 
+class Instrument(Settings):
+    """An instrument after the first, and how a policy for any spacecraft sees and moves what it is nearest for."""
+
+    boresight_B: Vector
+    scaling: Scaling
+
+
 class Metadata(Settings):
     """What a user of an exported controller must know; goes to and from JSON."""
 
@@ -69,27 +76,42 @@ class Metadata(Settings):
     provenance: Provenance
     scaling: Scaling | None = None
     """Of a policy for any spacecraft."""
+    further_instruments: tuple[Instrument, ...] = ()
+    """Those whose zones are told by the numbers 1, 2, ...; number 0 is ``boresight_B``, with ``scaling``."""
+
+    @property
+    def boresights_B(self) -> tuple[Vector, ...]:
+        """Boresights of all instruments, in body axes, by their numbers."""
+        return (self.boresight_B, *(instrument.boresight_B for instrument in self.further_instruments))
 
     def to_json(self, indent: int | None = None) -> str:
         """What exported files hold."""
-        return self.model_dump_json(indent=indent, exclude=None if self.scaling else {"scaling"})
+        unused = {name for name in ("scaling", "further_instruments") if not getattr(self, name)}
+        return self.model_dump_json(indent=indent, exclude=unused)
 
 
-def describe(policy: NumpyPolicy, task: TaskConfig | None = None, urgency: float = 0.5) -> Metadata:
+def describe(
+    policy: NumpyPolicy,
+    task: TaskConfig | None = None,
+    urgency: float = 0.5,
+    further_boresights: Sequence[Vector] = (),
+) -> Metadata:
     """Metadata of a policy.
 
-    task: with the spacecraft that it is exported for, by default its own; urgency: where none is set, of a policy that
-    sees one.
+    Args:
+        policy: who is exported.
+        task: with the spacecraft that it is exported for, by default its own.
+        urgency: where none is set, of a policy that sees one.
+        further_boresights: unit vectors (3,) in body axes, of the spacecraft's instruments after the first.
 
     Raises:
-        SettingsError: the spacecraft has wheels.
+        SettingsError: the spacecraft has wheels, or several instruments and the policy is not for any spacecraft.
 
     """
     record = policy.record
     task = task or record.task
-    if task.spacecraft.wheels:
-        raise SettingsError("spacecraft.wheels: are not exported yet; allowed is torque_limit")
     zones, scaled = record.network.observed_zones, record.network.scaled
+    _check(policy.name, scaled, task, len(further_boresights))
     where = slices(zones, scaled)
     limits = task.spacecraft.torque_limits
     return Metadata(
@@ -108,12 +130,27 @@ def describe(policy: NumpyPolicy, task: TaskConfig | None = None, urgency: float
         network=record.network,
         task=task,
         provenance=record.provenance,
-        scaling=_scaling(task, urgency) if scaled else None,
+        scaling=_scaling(task, urgency, task.spacecraft.boresight) if scaled else None,
+        further_instruments=tuple(
+            Instrument(boresight_B=boresight, scaling=_scaling(task, urgency, boresight))
+            for boresight in further_boresights
+        ),
     )
 
 
-def _scaling(task: TaskConfig, urgency: float) -> Scaling:
-    own = constants.of(task.spacecraft, task.step_seconds)
+def _check(name: str, scaled: bool, task: TaskConfig, further: int) -> None:
+    """Refuse what exports do not know."""
+    if task.spacecraft.wheels:
+        raise SettingsError("spacecraft.wheels: are not exported yet; allowed is torque_limit")
+    if further and not scaled:
+        raise SettingsError(
+            f"further_boresights: must be none for {name}, which was trained for one spacecraft with one instrument,"
+            f" got {further}"
+        )
+
+
+def _scaling(task: TaskConfig, urgency: float, boresight: Vector) -> Scaling:
+    own = constants.of(task.spacecraft, task.step_seconds, boresight)
     return Scaling.model_validate(
         {
             "time_unit": own.time,
@@ -155,6 +192,7 @@ def as_text(metadata: Metadata) -> str:
         *(_entry_text(entry) for entry in metadata.observation),
         f"Action: {metadata.action}.",
         *(_scaling_text(metadata.scaling) if metadata.scaling else ()),
+        *_instruments_text(metadata.further_instruments),
         f"Limits: torque {_torque(metadata.torque_limit)}; time step {metadata.step_seconds:g} s;"
         f" boresight {list(metadata.boresight_B)} in body axes; inertia {[list(r) for r in task.spacecraft.inertia]}"
         f" kg m^2; trained for {_count(task.scenario)} of {task.scenario.min_half_angle_deg:g} to"
@@ -170,19 +208,40 @@ def as_text(metadata: Metadata) -> str:
 
 
 def _scaling_text(scaling: Scaling) -> list[str]:
-    def text(values: Iterable[float]) -> str:
-        return ", ".join(f"{value:.6g}" for value in values)
-
-    def matrix(rows: Iterable[Vector]) -> str:
-        return "[" + ", ".join(f"[{text(row)}]" for row in rows) + "]"
-
-    seen = "; ".join(f"{name} {text(values)}" for name, values in scaling.seen.items())
     return [
         f"Units of this spacecraft: T = sqrt(J / u) = {scaling.time_unit:.6g} s, J = {scaling.inertia_unit:.6g} kg m^2,"
         f" u = {scaling.torque_unit:.6g} N m. The policy's axes have x along the boresight; their rows in body"
-        f" components: {matrix(scaling.axes)}. torque_per_action: {matrix(scaling.torque_per_action)} N m."
-        f" Constant parts of the observation: {seen}. Urgency u01 in [0, 1] is seen as 2 u01 - 1.",
+        f" components: {_matrix(scaling.axes)}. torque_per_action: {_matrix(scaling.torque_per_action)} N m."
+        f" Constant parts of the observation: {_seen(scaling)}. Urgency u01 in [0, 1] is seen as 2 u01 - 1.",
     ]
+
+
+def _instruments_text(further: Sequence[Instrument]) -> list[str]:
+    if not further:
+        return []
+    each = (
+        f"Instrument {number}: boresight [{_row(instrument.boresight_B)}] in body axes; axes"
+        f" {_matrix(instrument.scaling.axes)}; torque_per_action {_matrix(instrument.scaling.torque_per_action)} N m;"
+        f" constant parts {_seen(instrument.scaling)}."
+        for number, instrument in enumerate(further, 1)
+    )
+    return [
+        "The policy's axes are those of the nearest zone's instrument. Axes, torque_per_action and constant parts above"
+        " are of instrument 0.",
+        *each,
+    ]
+
+
+def _row(values: Iterable[float]) -> str:
+    return ", ".join(f"{value:.6g}" for value in values)
+
+
+def _matrix(rows: Iterable[Vector]) -> str:
+    return "[" + ", ".join(f"[{_row(row)}]" for row in rows) + "]"
+
+
+def _seen(scaling: Scaling) -> str:
+    return "; ".join(f"{name} {_row(values)}" for name, values in scaling.seen.items())
 
 
 def _count(scenario: ScenarioConfig) -> str:

@@ -1,5 +1,6 @@
 """Golden vectors of the shield: what it makes of requests everywhere, at a zone's edge, and inside a zone."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -8,6 +9,7 @@ import numpy as np
 from flax import struct
 
 from koz_jax.agents.agent import Agent
+from koz_jax.config.base import Vector
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.control.shield import filter as shield
 from koz_jax.control.shield.filter import Shield
@@ -36,7 +38,7 @@ _STEADY = 1e-2  # of the torque limit: another candidate is farther away
 class ShieldGolden(NamedTuple):
     """Situations and what the shield makes of them, none close to a threshold; leading axis (count,)."""
 
-    situation: np.ndarray  # (count, 11 + 4 zones) float32
+    situation: np.ndarray  # (count, 11 + 4 zones) float32, of several instruments (count, 11 + 5 zones)
     requested: np.ndarray  # (count, 3) float32 [N m]
     allowed: np.ndarray  # (count, 3) float32 [N m]
     safe: np.ndarray  # (count,) bool, whether the situation itself is safe
@@ -60,11 +62,13 @@ def _variants() -> list[_Variant]:
     return [_Variant(), *alone, *(_Variant(rate=float(rate), turn=float(turn)) for rate, turn in drawn)]
 
 
-def shield_golden(agent: Agent, config: ShieldConfig, count: int, seed: int = 0) -> ShieldGolden:
+def shield_golden(
+    agent: Agent, config: ShieldConfig, count: int, seed: int = 0, further_boresights: Sequence[Vector] = ()
+) -> ShieldGolden:
     """Draw situations and requests; of every kind, passed and not, about as many, as far as there are.
 
     Where other roundings could decide otherwise, as they do with a margin, a rate or an attitude that is a little
-    different, none is kept.
+    different, none is kept.  further_boresights: unit vectors (3,) in body axes, of instruments beside the task's own.
 
     Raises:
         SettingsError: there is no torque for what the shield is to withstand.
@@ -72,12 +76,12 @@ def shield_golden(agent: Agent, config: ShieldConfig, count: int, seed: int = 0)
     """
     limits = agent.task.spacecraft.torque_limits
     config.check(limits)
-    model, boresight_B = known(agent)
+    model, boresights_B = known(agent, further_boresights)
     made = shield.from_config(config, model)
-    drawn, kind = shield_situations(agent, config, _DRAWN_PER_VECTOR * count, seed)
+    drawn, kind = shield_situations(agent, config, _DRAWN_PER_VECTOR * count, seed, further_boresights)
     box = np.random.default_rng(seed).uniform(np.negative(limits), limits, (_DRAWN_PER_VECTOR * count, 3))
     requested = box.astype(np.float32)
-    answers = [_answer(made, drawn, requested, model, boresight_B, variant) for variant in _variants()]
+    answers = [_answer(made, drawn, requested, model, boresights_B, variant) for variant in _variants()]
     allowed, safe = (np.stack(answer) for answer in zip(*answers, strict=True))
     steady = np.all(np.ptp(allowed, axis=0) < _STEADY * np.array(limits), axis=1) & (safe[0] == safe).all(axis=0)
     passed = np.all(allowed == requested, axis=2)
@@ -86,15 +90,17 @@ def shield_golden(agent: Agent, config: ShieldConfig, count: int, seed: int = 0)
     return ShieldGolden(rows(drawn)[kept], requested[kept], allowed[0][kept], safe[0][kept])
 
 
-def shield_situations(agent: Agent, config: ShieldConfig, count: int, seed: int = 0) -> tuple[Situation, np.ndarray]:
+def shield_situations(
+    agent: Agent, config: ShieldConfig, count: int, seed: int = 0, further_boresights: Sequence[Vector] = ()
+) -> tuple[Situation, np.ndarray]:
     """Draw situations of all kinds.  Returns leaves (count, ...), and the kinds (count,).
 
     Those at an edge or inside have the nearest zone moved there, and rates of the order that the brake takes up in a
     step.
     """
     rng = np.random.default_rng(seed)
-    drawn = situations(agent, count, seed)
-    model, boresight_B = known(agent)
+    drawn = situations(agent, count, seed, 1 + len(further_boresights))
+    model, boresights_B = known(agent, further_boresights)
     made = shield.from_config(config, model)
     kind = np.resize(_KINDS, count)
     half_angle = np.asarray(drawn.zone_half_angle[:, 0])
@@ -103,7 +109,9 @@ def shield_situations(agent: Agent, config: ShieldConfig, count: int, seed: int 
         float(made.margin) * rng.uniform(*_EDGE_MARGINS, count),
         -half_angle * rng.uniform(0.0, _DEEPEST, count),
     )
-    look_N = jax.vmap(rotations.rotate, in_axes=(0, None))(drawn.q_BN, boresight_B)
+    which = drawn.zone_instrument
+    look_B = jnp.tile(boresights_B, (count, 1)) if which is None else boresights_B[which[:, 0]]
+    look_N = jax.vmap(rotations.rotate)(drawn.q_BN, look_B)
     side_N = jax.vmap(rotations.cross)(look_N, directions(rng, count, 3))
     side_N = side_N / jnp.linalg.norm(side_N, axis=1, keepdims=True)
     tilt = jax.vmap(rotations.from_axis_angle)(side_N, jnp.float32(half_angle + margin))
@@ -132,7 +140,7 @@ def _answer(
     drawn: Situation,
     requested: jax.Array,
     model: Model,
-    boresight_B: jax.Array,
+    boresights_B: jax.Array,
     variant: _Variant,
 ) -> tuple[jax.Array, jax.Array]:
     brake = made.brake.replace(inertia_error=made.brake.inertia_error + variant.inertia_error)
@@ -144,7 +152,7 @@ def _answer(
             q_BN=rotations.multiply(turned, situation.q_BN),
             omega_BN_B=(1.0 + variant.rate) * situation.omega_BN_B,
         )
-        at = told.state(model, boresight_B)
+        at = told.state(model, boresights_B)
         zones = at.scenario.constraints
         allowed_B = made.filter(at.body, torque_B, zones, state.torque_limits(at, model), model)
         return allowed_B, shield.is_safe(made, at.body, zones, model)

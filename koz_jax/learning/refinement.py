@@ -16,12 +16,12 @@ import optax
 import optax.contrib
 from flax import struct
 
+from koz_jax import devices
 from koz_jax.config.training import RefineConfig, TrainConfig
 from koz_jax.control.policy import PolicyController
 from koz_jax.control.shield.filter import under_shield
 from koz_jax.learning.train_step import MAX_DRAWS, flight_errors
 from koz_jax.sac.networks import Params
-from koz_jax.storage import runtime
 from koz_jax.task import rotations
 from koz_jax.task.any_spacecraft import spread
 from koz_jax.task.dynamics import RigidBodyState
@@ -224,13 +224,13 @@ def _clipped_gradient(
         return _clipped(pull(slopes)[0], config.refine.max_maneuver_gradient)
 
     costs, observed, slopes = jax.vmap(action_slopes)(keys)
-    together = min(_TOGETHER_ON_GPU if runtime.on_gpu() else 1, config.refine.scenarios)
+    together = min(_TOGETHER_ON_GPU if devices.on_gpu() else 1, config.refine.scenarios)
     gradients = jax.lax.map(weight_gradient, (observed, slopes), batch_size=together)
     return jnp.mean(costs), jax.tree.map(lambda leaf: jnp.mean(leaf, axis=0), gradients)
 
 
 @functools.partial(jax.jit, static_argnames="config", donate_argnames="state")
-@runtime.in_float32
+@devices.in_float32
 def refine_chunk(config: TrainConfig, state: RefineState, iterations: jax.Array) -> tuple[RefineState, jax.Array]:
     """Take ``iterations`` gradient steps (traced).  Returns the new state and the mean cost ()."""
     env = maneuver_environment(config)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from koz_jax import devices
 from koz_jax.config.training import TrainConfig
 from koz_jax.control import encoding
 from koz_jax.control.shield.filter import under_shield
@@ -16,7 +17,6 @@ from koz_jax.sac import replay_buffer
 from koz_jax.sac.learner import LearnerMetrics, LearnerState, Sac
 from koz_jax.sac.losses import Batch
 from koz_jax.sac.replay_buffer import ReplayBuffer, Transition
-from koz_jax.storage import runtime
 from koz_jax.task import observation_layout, reward
 from koz_jax.task.any_spacecraft import spread, units
 from koz_jax.task.environment import Reorientation
@@ -150,7 +150,7 @@ def _advance(
 
 
 @functools.partial(jax.jit, static_argnames="config")
-@runtime.in_float32
+@devices.in_float32
 def init(config: TrainConfig, key: jax.Array) -> TrainState:
     """Fresh networks, and a buffer filled with ``prefill_steps`` of random actions."""
     key_learner, key_envs, key_fill, key = jax.random.split(key, 4)
@@ -233,7 +233,7 @@ def train_step(config: TrainConfig, env: Reorientation, state: TrainState) -> tu
 
 
 @functools.partial(jax.jit, static_argnames="config", donate_argnames="state")
-@runtime.in_float32
+@devices.in_float32
 def train_chunk(config: TrainConfig, state: TrainState, steps: jax.Array) -> tuple[TrainState, TrainMetrics]:
     """Run ``steps`` training steps (traced: chunks of any length share one compilation) and average their metrics."""
     env = training_environment(config)

@@ -21,7 +21,7 @@ from koz_jax.errors import SettingsError
 from koz_jax.evaluation import cases
 from koz_jax.evaluation.summary import Summary, summarise
 from koz_jax.learning.finite_checks import NO_FAULT
-from koz_jax.runs import ahead, checkpoint, divergence, memory, provenance, sharding, stages
+from koz_jax.runs import checkpoint, divergence, memory, provenance, sharding, stages
 from koz_jax.runs.checkpoint import Checkpoint, RunState
 from koz_jax.runs.folder import RunFolder
 from koz_jax.runs.interrupt import GracefulShutdown
@@ -29,7 +29,7 @@ from koz_jax.runs.progress import Progress
 from koz_jax.runs.stages import Stage
 from koz_jax.runs.writer import RunWriter
 from koz_jax.sac.learner import LearnerState
-from koz_jax.storage import processes
+from koz_jax.storage import ahead, processes
 from koz_jax.storage.lock import FolderLock
 
 # Evaluation scenarios during training: the same for every run, and drawn from a seed that people do not type.

@@ -1,22 +1,16 @@
 """Process-wide settings of jax for the command lines; libraries and notebooks are left alone."""
 
-import functools
 import os
 import socket
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import ParamSpec, TypeVar
 
 import jax
 
 from koz_jax.errors import SettingsError
 from koz_jax.storage.processes import any_process
-
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
 
 # [s] in which processes must find each other
 _WAIT_S = 300.0
@@ -48,24 +42,6 @@ def keep_programs() -> None:
 def keeps_programs() -> bool:
     """Whether compiled programs are kept."""
     return jax.config.jax_compilation_cache_dir is not None  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def on_gpu() -> bool:
-    """Whether programs run on a GPU unless told otherwise."""
-    return jax.default_backend() == "gpu"
-
-
-def in_float32(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Let a function compute products of matrices in float32 on a GPU too, whose default has three digits (TF32)."""
-
-    @functools.wraps(function)
-    def exact(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        if not on_gpu():
-            return function(*args, **kwargs)
-        with jax.default_matmul_precision("float32"):
-            return function(*args, **kwargs)
-
-    return exact
 
 
 def join(coordinator: str, processes: int, process: int) -> None:

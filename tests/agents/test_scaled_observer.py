@@ -76,6 +76,27 @@ def test_of_several_instruments_the_axes_are_those_of_the_nearest_zones():
         np.testing.assert_allclose(observer.torque(action), limits * share, rtol=1e-5, atol=1e-6 * limits.max())
 
 
+@pytest.mark.parametrize("present", [1, 2, 3, 4])
+def test_of_four_zones_of_three_instruments_it_sees_what_the_core_does(present):
+    rng = np.random.default_rng(present)
+    where, mixed = slices(4, scaled=True), 0
+    for told in spacecraft.situations(50, seed=10 + present, zones=present):
+        looks = [told.spacecraft.boresight, spacecraft.direction(rng), spacecraft.direction(rng)]
+        around = [(*zone, looks[rng.integers(3)]) for zone in told.zones]
+        rate_deg = np.rad2deg(told.omega_BN_B)
+        at = state.begin(koz_jax.maneuver(told.q_BN, told.q_DN, around, rate_deg=rate_deg), told.model)
+        observer = ScaledObserver(told.spacecraft, told.step_seconds, told.urgency, observed_zones=4)
+        seen = observer.observe(told.q_BN, told.omega_BN_B, told.q_DN, around)
+        expected = np.asarray(nondimensional.observe(at, told.model, told.urgency, zones=4))
+        assert seen.shape == (size(4, scaled=True),)
+        np.testing.assert_allclose(seen, expected, rtol=0, atol=2e-5)
+        # Its own instrument is a unit vector, at an angle to the nearest zone's that no axes change.
+        seen_looks = np.array([seen[where[f"{number}_boresight_P"]] for number in (2, 3, 4)])
+        np.testing.assert_allclose(np.linalg.norm(seen_looks, axis=1), np.arange(2, 5) <= present, atol=1e-6)
+        mixed += int(np.any(np.abs(seen_looks[: present - 1, 0] - 1.0) > 1e-3))
+    assert present == 1 or 20 < mixed < 50
+
+
 def test_axes_of_the_core_are_exact_also_near_the_half_turn():
     """1 + x cancels there in single precision: axes were off by 1e-2."""
     for away in (1e-2, 3e-3, 2e-3):

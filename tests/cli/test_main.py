@@ -13,7 +13,7 @@ from koz_jax.agents.record import shipped_agents
 from koz_jax.cli import invocation
 from koz_jax.cli.exit_status import exit_status
 from koz_jax.cli.main import COMMANDS, main
-from koz_jax.config.presets import PRESETS
+from koz_jax.config.presets.named import PRESETS
 from koz_jax.control.registry import BUILT_IN
 from koz_jax.errors import SettingsError
 from koz_jax.evaluation.monte_carlo import _log

@@ -22,7 +22,7 @@ from koz_jax.agents.agent import load_agent
 from koz_jax.cli import train as train_cli
 from koz_jax.cli.train import TrainFlags, parse
 from koz_jax.config.base import Settings
-from koz_jax.config.presets import PRESETS, preset
+from koz_jax.config.presets.named import PRESETS, preset
 from koz_jax.config.training import TrainConfig
 from koz_jax.learning import train_step
 from koz_jax.runs import checkpoint, memory

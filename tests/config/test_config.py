@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from koz_jax.config import presets
 from koz_jax.config.base import Settings, checked, constant, ramp_value
 from koz_jax.config.monte_carlo import MonteCarloConfig
+from koz_jax.config.presets import named as presets
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import SpacecraftConfig, TaskConfig, check_deviations, is_paper_task
 from koz_jax.config.training import TrainConfig

@@ -8,7 +8,7 @@ import pytest
 
 from koz_jax.agents.record import read_agent_record, shipped_agents, shipped_folder
 from koz_jax.config import plausibility
-from koz_jax.config.presets import PRESETS, preset
+from koz_jax.config.presets.named import PRESETS, preset
 from koz_jax.config.task import SpacecraftConfig, TaskConfig
 from koz_jax.errors import SettingsError
 

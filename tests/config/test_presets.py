@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from koz_jax.config import presets
 from koz_jax.config.base import ramp_value
 from koz_jax.config.curriculum import PhaseConfig
+from koz_jax.config.presets import named as presets
 from koz_jax.config.task import ScenarioConfig
 from koz_jax.config.training import EncodingConfig, TrainConfig
 from koz_jax.errors import SettingsError

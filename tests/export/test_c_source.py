@@ -67,16 +67,16 @@ def of_other_task(agent: Agent) -> Agent:
     return dataclasses.replace(agent, task=task.model_copy(update={"spacecraft": body, "scenario": scenario}))
 
 
-def blank_vectors(agent: Agent, config: ShieldConfig, count: int) -> ShieldGolden:
+def blank_vectors(agent: Agent, config: ShieldConfig, count: int, further_boresights: tuple = ()) -> ShieldGolden:
     """Vectors of the right shape for a self-test that is compiled and not run: none need be searched for."""
     zones = exported_zone_count(agent.controller.network, agent.task.scenario)
-    torques = np.zeros((count, 3), np.float32)
-    return ShieldGolden(np.zeros((count, 11 + 4 * zones), np.float32), torques, torques, np.zeros(count, bool))
+    torques, size = np.zeros((count, 3), np.float32), 11 + (5 if further_boresights else 4) * zones
+    return ShieldGolden(np.zeros((count, size), np.float32), torques, torques, np.zeros(count, bool))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
-@pytest.mark.parametrize("kind", ["plain", "robust", "unequal", "scaled"])
+@pytest.mark.parametrize("kind", ["plain", "robust", "unequal", "scaled", "instruments"])
 def test_everything_compiles_without_a_warning(agent, folder, tmp_path, monkeypatch, compiler, kind):
     if shutil.which(compiler) is None:
         pytest.skip(f"there is no {compiler}")
@@ -84,8 +84,10 @@ def test_everything_compiles_without_a_warning(agent, folder, tmp_path, monkeypa
     if kind != "plain":
         where = tmp_path
         monkeypatch.setattr(files, "shield_golden", blank_vectors)
-        exported = {"robust": agent, "unequal": of_other_task(agent), "scaled": spacecraft.agent()}[kind]
-        write_files(where, export(exported, "c", ROBUST))
+        several = spacecraft.agent(spacecraft.SCALED.model_copy(update={"observed_zones": 3}))
+        exported = {"robust": agent, "unequal": of_other_task(agent), "scaled": spacecraft.agent()}.get(kind, several)
+        others = ((0.0, 0.0, -1.0), (-0.6, 0.8, 0.0)) if kind == "instruments" else ()
+        write_files(where, export(exported, "c", ROBUST, further_boresights=others))
     for name in SOURCES:
         knows = b"KOZ_WITH_SHIELD" in (where / name).read_bytes()
         for defined in ((), ("-DKOZ_WITH_SHIELD",)) if knows else ((),):

@@ -5,7 +5,7 @@ import pytest
 from support import tiny
 from support.drawn import crowded_labels, metrics_log
 
-from koz_jax.config.presets import preset
+from koz_jax.config.presets.named import preset
 from koz_jax.figures import learning
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from koz_jax.config.curriculum import CurriculumConfig, PhaseConfig
-from koz_jax.config.presets import PRESETS, preset
+from koz_jax.config.presets.named import PRESETS, preset
 from koz_jax.learning import curriculum
 from koz_jax.learning.curriculum import Difficulty
 from koz_jax.task.reward import PAPER_WEIGHTS

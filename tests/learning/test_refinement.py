@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from koz_jax.config.presets import preset
+from koz_jax.config.presets.named import preset
 from koz_jax.config.training import RefineConfig, TrainConfig
 from koz_jax.control.policy import PolicyController, policy_network
 from koz_jax.learning import refinement

@@ -12,7 +12,7 @@ from scipy import stats
 
 from koz_jax.config.base import constant
 from koz_jax.config.curriculum import CurriculumConfig, PhaseConfig
-from koz_jax.config.presets import preset
+from koz_jax.config.presets.named import preset
 from koz_jax.config.spread import SpreadConfig
 from koz_jax.config.task import RewardConfig, ScenarioConfig, TaskConfig
 from koz_jax.config.training import NetworkConfig, SacConfig, TrainConfig

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from koz_jax.cli.evaluate import EvaluateFlags
 from koz_jax.cli.train import TrainFlags
 from koz_jax.config.base import Settings
-from koz_jax.config.presets import preset
+from koz_jax.config.presets.named import preset
 from koz_jax.evaluation import cases, monte_carlo
 from koz_jax.runs import checkpoint, seeds
 from support import tiny

@@ -20,7 +20,7 @@ import numpy as np
 
 from koz_jax.agents.agent import Agent
 from koz_jax.agents.record import Provenance
-from koz_jax.config.presets import preset
+from koz_jax.config.presets.named import preset
 from koz_jax.config.training import NetworkConfig, TrainConfig
 from koz_jax.control.policy import PolicyController, policy_network
 from koz_jax.runs.folder import RunFolder

@@ -19,7 +19,7 @@
 #define SETTLED_DEG @SETTLED_DEG@
 
 static const double degrees = 57.29577951308232;
-static const double boresight_B[3] = {@EXACT_BORESIGHT@};
+static const double boresight_B@OF_INSTRUMENTS@[3] = {@EXACT_BORESIGHT@};
 static const double inertia[3][3] = {@EXACT_INERTIA@}; /* [kg m^2] */
 static const double inverse_inertia[3][3] = {@EXACT_INVERSE_INERTIA@};
 
@@ -108,10 +108,14 @@ static double smallest_margin(const koz_situation *now)
     double q[4], looking_N[3], t[3], u[3], axis_N[3], apart[3], margin, smallest = 360.0;
     int i, zone;
     for (i = 0; i < 4; i++) q[i] = (double)now->q_BN[i];
-    cross(q + 1, boresight_B, t);
-    cross(q + 1, t, u);
-    for (i = 0; i < 3; i++) looking_N[i] = boresight_B[i] + 2.0 * (q[0] * t[i] + u[i]);
+@ONE@    cross(q + 1, boresight_B, t);
+@ONE@    cross(q + 1, t, u);
+@ONE@    for (i = 0; i < 3; i++) looking_N[i] = boresight_B[i] + 2.0 * (q[0] * t[i] + u[i]);
     for (zone = 0; zone < KOZ_ZONES; zone++) {
+@SEVERAL@        const double *look_B = boresight_B[now->zone_instrument[zone]];
+@SEVERAL@        cross(q + 1, look_B, t);
+@SEVERAL@        cross(q + 1, t, u);
+@SEVERAL@        for (i = 0; i < 3; i++) looking_N[i] = look_B[i] + 2.0 * (q[0] * t[i] + u[i]);
         for (i = 0; i < 3; i++) axis_N[i] = (double)now->zone_axis_N[zone][i];
         cross(looking_N, axis_N, apart);
         margin = atan2(sqrt(dot(apart, apart)), dot(looking_N, axis_N)) - (double)now->zone_half_angle[zone];
@@ -144,7 +148,7 @@ int main(void)
             return 1;
         }
         koz_observe(&memory, &now, observation);
-        koz_torque(observation, requested_B);
+        koz_torque(@MEMORY_ARGUMENT@observation, requested_B);
 #ifdef KOZ_WITH_SHIELD
         koz_shield(&now, requested_B, torque_B);
 #else

@@ -10,7 +10,7 @@
 
 #include "koz_policy.h"
 
-static const float koz_boresight_B[3] = {@BORESIGHT@};
+static const float koz_boresight_B@OF_INSTRUMENTS@[3] = {@BORESIGHT@};
 
 static inline float koz_dot(const float a[3], const float b[3])
 {
@@ -69,6 +69,12 @@ static inline void koz_to_unit(float *v, int size)
     for (i = 0; i < size; i++) v[i] = squared > 0.0f ? v[i] / sqrtf(squared) : v[i];
 }
 
+@SEVERAL@/* The number of an instrument; 0 in place of what is none, so that nothing else is read. */
+@SEVERAL@static inline int koz_instrument(int number)
+@SEVERAL@{
+@SEVERAL@    return number >= 0 && number < KOZ_INSTRUMENTS ? number : 0;
+@SEVERAL@}
+@SEVERAL@
 /* The same situation with quaternions and axes of unit length. */
 static inline koz_situation koz_unit_situation(const koz_situation *given)
 {
@@ -77,6 +83,7 @@ static inline koz_situation koz_unit_situation(const koz_situation *given)
     koz_to_unit(unit.q_BN, 4);
     koz_to_unit(unit.q_DN, 4);
     for (zone = 0; zone < KOZ_ZONES; zone++) koz_to_unit(unit.zone_axis_N[zone], 3);
+@SEVERAL@    for (zone = 0; zone < KOZ_ZONES; zone++) unit.zone_instrument[zone] = koz_instrument(unit.zone_instrument[zone]);
     return unit;
 }
 

@@ -29,6 +29,8 @@ const char *koz_fault(const koz_situation *now)
         if (!(fabsf(now->zone_half_angle[zone]) <= pi)) return "zone_half_angle: must be at most pi in radians";
         if (!is_direction(now->zone_axis_N[zone], 3) && now->zone_half_angle[zone] > 0.0f)
             return "zone_axis_N: must be finite and not zero";
+@SEVERAL@        if (koz_instrument(now->zone_instrument[zone]) != now->zone_instrument[zone])
+@SEVERAL@            return "zone_instrument: must be at least 0 and below KOZ_INSTRUMENTS";
     }
     return NULL;
 }
@@ -67,7 +69,7 @@ static void zone_direction(const koz_situation *unit, int zone, float direction_
     int i;
     koz_conjugate(unit->q_BN, to_body);
     koz_rotate(to_body, unit->zone_axis_N[zone], axis_B);
-    for (i = 0; i < 3; i++) direction_B[i] = axis_B[i] - koz_boresight_B[i];
+    for (i = 0; i < 3; i++) direction_B[i] = axis_B[i] - koz_boresight_B@OF_UNIT_ZONE@[i];
     koz_to_unit(direction_B, 3);
 }
 
@@ -77,8 +79,9 @@ void koz_observe(koz_memory *memory, const koz_situation *now, float observation
     float angle[KOZ_ZONES], margin[KOZ_ZONES], boresight_N[3];
     int seen[KOZ_ZONES];
     int i, zone, place, nearest;
-@OBSERVE_BODY@    koz_rotate(unit.q_BN, koz_boresight_B, boresight_N);
+@OBSERVE_BODY@@ONE@    koz_rotate(unit.q_BN, koz_boresight_B, boresight_N);
     for (zone = 0; zone < KOZ_ZONES; zone++) {
+@SEVERAL@        koz_rotate(unit.q_BN, koz_boresight_B[unit.zone_instrument[zone]], boresight_N);
         angle[zone] = koz_angle(boresight_N, unit.zone_axis_N[zone]);
         margin[zone] = angle[zone] - unit.zone_half_angle[zone];
         seen[zone] = 0;
@@ -94,7 +97,7 @@ void koz_observe(koz_memory *memory, const koz_situation *now, float observation
 @ZONE_DIRECTION@        if (@WHICH_ABSENT@unit.zone_half_angle[nearest] <= 0.0f) {
             part[0] = part[1] = pi;
             part[2] = part[3] = part[4] = 0.0f;
-        }
+@ABSENT_BORESIGHT@        }
     }
 @OBSERVE_SPACECRAFT@}
 
@@ -116,6 +119,8 @@ static void dense(const float *x, int inputs, const float *kernel, const float *
 @DECIDE@
 }
 
-void koz_torque(const float observation[KOZ_OBSERVATION_SIZE], float torque_B[KOZ_ACTION_SIZE])
+@ONE@void koz_torque(const float observation[KOZ_OBSERVATION_SIZE], float torque_B[KOZ_ACTION_SIZE])
+@SEVERAL@void koz_torque(const koz_memory *memory, const float observation[KOZ_OBSERVATION_SIZE],
+@SEVERAL@    float torque_B[KOZ_ACTION_SIZE])
 {
 @TORQUE@}

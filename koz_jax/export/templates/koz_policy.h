@@ -7,6 +7,7 @@
 #define KOZ_OBSERVATION_SIZE @OBSERVATION_SIZE@
 #define KOZ_ZONES @ZONES@ /* zones to be told of */
 #define KOZ_OBSERVED_ZONES @OBSERVED_ZONES@ /* of which the policy sees the nearest */
+@SEVERAL@#define KOZ_INSTRUMENTS @INSTRUMENTS@ /* that zones are for */
 #define KOZ_ACTION_SIZE @ACTION_SIZE@
 #define @LIMIT_DEFINITION@
 #define KOZ_STEP_SECONDS @STEP_SECONDS@ /* [s] between decisions; the torque is held in between */
@@ -29,6 +30,7 @@ typedef struct {
     float q_DN[4];       /* target attitude; of either sign, the same one from koz_start on */
     float zone_axis_N[KOZ_ZONES][3];  /* unit vectors to the bright objects, in inertial axes */
     float zone_half_angle[KOZ_ZONES]; /* [rad]; -pi where there is no zone */
+@SEVERAL@    int zone_instrument[KOZ_ZONES];   /* number of the instrument that the zone is for, from 0 */
 } koz_situation;
 
 /* What the controller keeps from one step to the next. */
@@ -49,7 +51,10 @@ void koz_observe(koz_memory *memory, const koz_situation *now, float observation
 void koz_decide(const float observation[KOZ_OBSERVATION_SIZE], float action[KOZ_ACTION_SIZE]);
 
 /* Torque in body axes [N m], to be held for KOZ_STEP_SECONDS; zero where an observation is not finite. */
-void koz_torque(const float observation[KOZ_OBSERVATION_SIZE], float torque_B[KOZ_ACTION_SIZE]);
+@SEVERAL@/* It needs the memory as the koz_observe left it that made the observation. */
+@ONE@void koz_torque(const float observation[KOZ_OBSERVATION_SIZE], float torque_B[KOZ_ACTION_SIZE]);
+@SEVERAL@void koz_torque(const koz_memory *memory, const float observation[KOZ_OBSERVATION_SIZE],
+@SEVERAL@    float torque_B[KOZ_ACTION_SIZE]);
 
 #ifdef __cplusplus
 }

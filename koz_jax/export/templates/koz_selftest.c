@@ -52,7 +52,7 @@ int main(void)
         koz_observe(&memory, &situations[n], observation);
         for (i = 0; i < KOZ_OBSERVATION_SIZE; i++) observed = worse(observed, observation[i], observations[n][i]);
 @MEMORY_CHECK@        koz_decide(observations[n], action);
-        koz_torque(observations[n], torque_B);
+        koz_torque(@MEMORY_ARGUMENT@observations[n], torque_B);
         for (i = 0; i < KOZ_ACTION_SIZE; i++) {
             decided = worse(decided, action[i], actions[n][i]);
             applied = worse(applied, torque_B[i], @EXPECTED_TORQUE@);
@@ -62,7 +62,7 @@ int main(void)
     start = clock();
     for (n = 0; n < DECISIONS; n++) {
         koz_observe(&memory, &situations[n % COUNT], observation);
-        koz_torque(observation, torque_B);
+        koz_torque(@MEMORY_ARGUMENT@observation, torque_B);
         kept += torque_B[0];
     }
     seconds = (double)(clock() - start) / (double)CLOCKS_PER_SEC;

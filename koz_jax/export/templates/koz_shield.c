@@ -23,7 +23,7 @@ static const float inertia[3][3] = {@INERTIA@};
 static const float inverse_inertia[3][3] = {@INVERSE_INERTIA@};
 static const float smallest_moment = @SMALLEST_MOMENT@; /* [kg m^2] of inertia */
 static const float largest_moment = @LARGEST_MOMENT@;
-static const float speed_per_momentum = @SPEED_PER_MOMENTUM@; /* [1/(kg m^2)] largest, of the boresight */
+static const float speed_per_momentum@OF_INSTRUMENTS@ = @SPEED_PER_MOMENTUM@; /* [1/(kg m^2)] largest, of the boresight */
 static const float shield_margin = @MARGIN@; /* [rad] kept from every zone */
 static const float brake_limit = @BRAKE_TORQUE@; /* [N m] norm of the torque that brakes */
 static const float attitude_error = @ATTITUDE_ERROR@; /* [rad] largest, of what is measured */
@@ -163,9 +163,10 @@ static float margin_at(const koz_situation *now, int zone, float cosine)
 }
 
 /* Bound on the second derivative of the boresight in free motion. */
-static float bend(float momentum, float rate)
+@ONE@static float bend(float momentum, float rate)
+@SEVERAL@static float bend(const koz_situation *now, int zone, float momentum, float rate)
 {
-    const float speed = speed_per_momentum * momentum;
+    const float speed = speed_per_momentum@OF_ZONE@ * momentum;
     return rate * (speed + smaller(speed, rate));
 }
 
@@ -232,13 +233,15 @@ static float clearance(const koz_situation *now, const body_state *body, float p
     coast at;
     int zone, done;
     rate = sqrtf(twice_energy(body, &momentum) / smallest_moment);
-    speed = smaller(speed_per_momentum * momentum, rate);
+@ONE@    speed = smaller(speed_per_momentum * momentum, rate);
     length = free_seconds(momentum);
     piece = length / (float)SAMPLES;
     bound = tolerance_of(momentum, rate, length, push_error);
-    koz_rotate(body->q_BN, koz_boresight_B, look_N);
+@ONE@    koz_rotate(body->q_BN, koz_boresight_B, look_N);
     for (zone = 0; zone < KOZ_ZONES; zone++) {
         if (now->zone_half_angle[zone] <= 0.0f) continue;
+@SEVERAL@        speed = smaller(speed_per_momentum@OF_ZONE@ * momentum, rate);
+@SEVERAL@        koz_rotate(body->q_BN, koz_boresight_B@OF_ZONE@, look_N);
         found = koz_angle(look_N, now->zone_axis_N[zone]) - now->zone_half_angle[zone];
         lowest = smaller(lowest, found - speed * length - tolerated(&bound, 1.0f, length));
     }
@@ -246,13 +249,18 @@ static float clearance(const koz_situation *now, const body_state *body, float p
     multiply(inertia, body->omega_BN_B, at.v[0]);
     koz_conjugate(body->q_BN, to_body);
     for (zone = 0; zone < KOZ_ZONES; zone++) koz_rotate(to_body, now->zone_axis_N[zone], at.v[1 + zone]);
-    bulge = bend(momentum, rate) * piece * piece / 8.0f;
+@ONE@    bulge = bend(momentum, rate) * piece * piece / 8.0f;
     lowest = unbounded;
     for (done = 0; done <= SAMPLES && lowest >= least; done++) {
         const float off = tolerated(&bound, (float)done / (float)SAMPLES, (float)done * piece);
         if (done > 0) coast_on(&at, piece);
-        for (zone = 0; zone < KOZ_ZONES; zone++)
-            lowest = smaller(lowest, margin_at(now, zone, koz_dot(koz_boresight_B, at.v[1 + zone]) + bulge) - off);
+@ONE@        for (zone = 0; zone < KOZ_ZONES; zone++)
+@ONE@            lowest = smaller(lowest, margin_at(now, zone, koz_dot(koz_boresight_B, at.v[1 + zone]) + bulge) - off);
+@SEVERAL@        for (zone = 0; zone < KOZ_ZONES; zone++) {
+@SEVERAL@            found = koz_dot(koz_boresight_B@OF_ZONE@, at.v[1 + zone]);
+@SEVERAL@            bulge = bend(now, zone, momentum, rate) * piece * piece / 8.0f;
+@SEVERAL@            lowest = smaller(lowest, margin_at(now, zone, found + bulge) - off);
+@SEVERAL@        }
     }
     return lowest;
 }
@@ -268,11 +276,15 @@ static float step_clearance(
     energy = larger(energy, twice_energy(after, &momentum_after));
     momentum = larger(momentum, momentum_after) + 0.5f * size * dt;
     rate = sqrtf(energy / smallest_moment) + size * dt / (2.0f * smallest_moment);
-    bulge = (bend(momentum, rate) + speed_per_momentum * size) * dt * dt / 8.0f;
-    koz_rotate(before->q_BN, koz_boresight_B, start_N);
-    koz_rotate(after->q_BN, koz_boresight_B, end_N);
+@ONE@    bulge = (bend(momentum, rate) + speed_per_momentum * size) * dt * dt / 8.0f;
+@ONE@    koz_rotate(before->q_BN, koz_boresight_B, start_N);
+@ONE@    koz_rotate(after->q_BN, koz_boresight_B, end_N);
     for (zone = 0; zone < KOZ_ZONES; zone++) {
         const float *axis_N = now->zone_axis_N[zone];
+@SEVERAL@        bulge = bend(now, zone, momentum, rate) + speed_per_momentum@OF_ZONE@ * size;
+@SEVERAL@        bulge *= dt * dt / 8.0f;
+@SEVERAL@        koz_rotate(before->q_BN, koz_boresight_B@OF_ZONE@, start_N);
+@SEVERAL@        koz_rotate(after->q_BN, koz_boresight_B@OF_ZONE@, end_N);
         lowest = smaller(
             lowest, margin_at(now, zone, larger(koz_dot(axis_N, start_N), koz_dot(axis_N, end_N)) + bulge));
     }
@@ -319,14 +331,16 @@ static float guide(
     float to_body[4], axis_B[3], look_N[3], out_B[3], nearest_B[3] = {0.0f, 0.0f, 0.0f}, side_B[3], rate_B[3];
     float momentum_B[3], gyroscopic_B[3], pushed_B[3], soon_B[3], missing_B[3] = {0.0f, 0.0f, 0.0f};
     float margin, size, missing, sideways, nearest = unbounded;
+@SEVERAL@    const float *look_B = koz_boresight_B[0]; /* that of the nearest zone */
     int zone, i;
     koz_conjugate(body->q_BN, to_body);
-    koz_rotate(body->q_BN, koz_boresight_B, look_N);
+@ONE@    koz_rotate(body->q_BN, koz_boresight_B, look_N);
     for (zone = 0; zone < KOZ_ZONES; zone++) {
         if (now->zone_half_angle[zone] <= 0.0f) continue;
+@SEVERAL@        koz_rotate(body->q_BN, koz_boresight_B@OF_ZONE@, look_N);
         margin = koz_angle(look_N, now->zone_axis_N[zone]) - now->zone_half_angle[zone];
         koz_rotate(to_body, now->zone_axis_N[zone], axis_B);
-        koz_cross(axis_B, koz_boresight_B, out_B);
+        koz_cross(axis_B, koz_boresight_B@OF_ZONE@, out_B);
         size = koz_norm(out_B);
         missing = (2.0f * shield_margin - margin) / (guide_ahead * guide_seconds);
         missing = larger(0.0f, smaller(guide_rate, missing));
@@ -335,9 +349,11 @@ static float guide(
             missing_B[i] += missing * out_B[i];
             if (margin < nearest) nearest_B[i] = out_B[i];
         }
+@SEVERAL@        if (margin < nearest) look_B = koz_boresight_B@OF_ZONE@;
         nearest = smaller(nearest, margin);
     }
-    koz_cross(nearest_B, koz_boresight_B, side_B);
+@ONE@    koz_cross(nearest_B, koz_boresight_B, side_B);
+@SEVERAL@    koz_cross(nearest_B, look_B, side_B);
     multiply(inertia, body->omega_BN_B, momentum_B);
     koz_cross(body->omega_BN_B, momentum_B, gyroscopic_B);
     for (i = 0; i < 3; i++) pushed_B[i] = requested_B[i] - gyroscopic_B[i];

@@ -110,8 +110,23 @@ def _thorough() -> TrainConfig:
     )
 
 
+# An agent for any spacecraft draws another one for every maneuver, with instruments, rate limit and urgency.
+_ANY = SpreadConfig(
+    spacecraft=True,
+    zones=(1, 4),
+    instruments=3,
+    keep_in=0.2,
+    step_shares=(0.016, 0.06),
+    # To far above what a maneuver needs: an agent without a limit is at the end of what it knows.
+    max_rate_deg=(2.0, 150.0),
+    urgency=(0.0, 1.0),
+    errors=UncertaintyConfig(inertia_error=0.1, disturbance_torque=0.01, attitude_noise_deg=0.01, rate_noise_deg=0.001),
+    delay_steps=(0, 2),
+)
+
+
 def _universal() -> TrainConfig:
-    """An agent for any spacecraft: it is drawn anew for every maneuver, with instruments, rate limit and urgency."""
+    """An agent for any spacecraft, by far the longest training: sized for a GPU, hours on a CPU."""
     fast = _fast()
     phases = fast.curriculum
     # Soft Actor-Critic has only to find the way around; refinement does the rest.
@@ -119,26 +134,25 @@ def _universal() -> TrainConfig:
         phase1=phases.phase1.model_copy(update={"updates": 32_000}),
         phase2=phases.phase2.model_copy(update={"updates": 64_000}),
     )
+    refine = {
+        "horizon_seconds": 45.0,
+        "optimizer": "muon",
+        "learning_rate": 3e-3,
+        "effort_weight": 3.46,
+        "urgency_factor": 14.0,
+        "rate_weight": 20.0,
+        "change_weight": 5.0,
+        "max_maneuver_gradient": 0.1,
+        "state_gradient": (1.0, 300.0),
+        "max_gradient_norm": 1.0,
+        "scenarios": 96,
+        "iterations": 7000,
+    }
     return fast.model_copy(
         update={
             "preset": "universal",
             "curriculum": shorter,
-            "task": TaskConfig(
-                spread=SpreadConfig(
-                    spacecraft=True,
-                    zones=(1, 4),
-                    instruments=3,
-                    keep_in=0.2,
-                    step_shares=(0.016, 0.06),
-                    # To far above what a maneuver needs: an agent without a limit is at the end of what it knows.
-                    max_rate_deg=(2.0, 150.0),
-                    urgency=(0.0, 1.0),
-                    errors=UncertaintyConfig(
-                        inertia_error=0.1, disturbance_torque=0.01, attitude_noise_deg=0.01, rate_noise_deg=0.001
-                    ),
-                    delay_steps=(0, 2),
-                )
-            ),
+            "task": TaskConfig(spread=_ANY),
             "eval_cases": 400,
             "refine_eval_every": 500,
             "network": NetworkConfig(
@@ -147,22 +161,7 @@ def _universal() -> TrainConfig:
                 observed_zones=4,
                 scaled=True,
             ),
-            "refine": fast.refine.model_copy(
-                update={
-                    "horizon_seconds": 45.0,
-                    "optimizer": "muon",
-                    "learning_rate": 3e-3,
-                    "effort_weight": 3.46,
-                    "urgency_factor": 14.0,
-                    "rate_weight": 20.0,
-                    "change_weight": 5.0,
-                    "max_maneuver_gradient": 0.1,
-                    "state_gradient": (1.0, 300.0),
-                    "max_gradient_norm": 1.0,
-                    "scenarios": 96,
-                    "iterations": 7000,
-                }
-            ),
+            "refine": fast.refine.model_copy(update=refine),
         }
     )
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from koz_jax.config.base import Settings
-from koz_jax.config.presets import preset
+from koz_jax.config.presets.named import preset
 from koz_jax.config.training import TrainConfig
 
 Sizes = Mapping[str, Any]  # by the names of the flags

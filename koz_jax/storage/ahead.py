@@ -8,6 +8,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
 
+from koz_jax import devices
 from koz_jax.storage import runtime
 
 Compile = Callable[[], None]
@@ -17,7 +18,7 @@ Await = Callable[[str], None]  # returns when the program of this name is there,
 @contextlib.contextmanager
 def compiling(programs: Mapping[str, Compile]) -> Iterator[Await]:
     """Compile programs by name, where that pays; yields what waits for one of them."""
-    if not (programs and runtime.on_gpu() and runtime.keeps_programs()):
+    if not (programs and devices.on_gpu() and runtime.keeps_programs()):
         yield lambda name: None
         return
     pool = ThreadPoolExecutor(len(programs), "compile")

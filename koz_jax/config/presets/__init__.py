@@ -1,0 +1,1 @@
+"""Named training configurations, and their sizes on a GPU."""
