@@ -38,7 +38,8 @@ class TrainFlags(ProcessFlags):
     resume: Path | None = None
     """Go on exactly where the run in this folder stopped; takes all settings from it."""
     start_from: Path | None = None
-    """Begin with the learner and the replay buffer of a snapshot, or of another run."""
+    """Begin with the learner and the replay buffer of a snapshot, or of another run; where both phases have 0 updates,
+    with an agent by name or folder, and refine it."""
     cases: CaseCount | None = None
     """Monte Carlo cases of the table at the end; by default 10,000, or as many as a resumed run was begun with."""
     devices: PositiveInt = 1

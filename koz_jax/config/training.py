@@ -195,17 +195,20 @@ class TrainConfig(Settings):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if self.curriculum.updates == 0:
-            raise ValueError("curriculum must have at least one update in phase1.updates + phase2.updates; got 0")
+        if self.length == 0:
+            raise ValueError(
+                "curriculum must have at least one update in phase1.updates + phase2.updates, or refine at least one"
+                " iteration; got 0"
+            )
         if self.curriculum.updates >= 2**31:
             raise ValueError(
                 "curriculum must have less than 2^31 updates in phase1.updates + phase2.updates; got"
                 f" {self.curriculum.updates}"
             )
-        if self.refine.iterations and not self.curriculum.phase2.updates:
+        if self.refine.iterations and self.curriculum.updates and not self.curriculum.phase2.updates:
             raise ValueError(
-                "refine.iterations must be 0 where curriculum.phase2.updates is 0: refinement polishes the agent of"
-                f" phase 2; got {self.refine.iterations}"
+                "refine.iterations must be 0 where curriculum has phase1.updates but no phase2.updates: refinement"
+                f" polishes the agent of phase 2; got {self.refine.iterations}"
             )
         if self.sac.batch_size > self.sac.buffer_size:
             raise ValueError(
@@ -257,6 +260,11 @@ class TrainConfig(Settings):
     def length(self) -> int:
         """Length of the run: gradient updates, then refinement iterations."""
         return self.curriculum.updates + self.refine.iterations
+
+    @property
+    def refines_alone(self) -> bool:
+        """Whether it only polishes an agent that there is already."""
+        return self.curriculum.updates == 0
 
     @property
     def training_episode_steps(self) -> int:

@@ -13,7 +13,9 @@ import numpy as np
 from flax import struct, traverse_util
 from pydantic import ValidationError
 
+from koz_jax.agents.agent import load_agent
 from koz_jax.config.training import TrainConfig
+from koz_jax.control.policy import PolicyController
 from koz_jax.errors import DamagedFileError, SettingsError, StorageError, explain
 from koz_jax.learning import refinement, train_step
 from koz_jax.learning.refinement import RefineState
@@ -41,10 +43,14 @@ class RunState(struct.PyTreeNode):
         return int(self.train.updates) + int(self.refine.iterations)
 
 
-def begin(config: TrainConfig, source: RunState | None) -> RunState:
-    """Make the state that a run begins with; learner and replay buffer are those of another run where one is given."""
+def begin(config: TrainConfig, source: RunState | PolicyController | None) -> RunState:
+    """Make the state that a run begins with; learner and replay buffer, or the policy alone, as in the source."""
     state = train_step.init(config, jax.random.key(config.seed))
-    if source is not None:
+    if isinstance(source, PolicyController):
+        policy = source.policy
+        learner = state.learner.replace(policy=policy, averaged_policy=jax.tree.map(jnp.copy, policy))
+        state = state.replace(learner=learner)
+    elif source is not None:
         buffer = replay_buffer.truncate_newest(source.train.buffer)
         state = state.replace(learner=source.train.learner, buffer=buffer)
     return begin_phase(config, state)
@@ -139,6 +145,20 @@ def load(folder: RunFolder, config: TrainConfig) -> Checkpoint:
         )
     path, state = _newest_good(found, config, refuse)
     return Checkpoint(state, str(archive.read_record(path).get("log", "")))
+
+
+def load_agent_source(name: str | Path, config: TrainConfig) -> PolicyController:
+    """Load an agent for a run with ``config``, which only refines it.
+
+    Raises:
+        SettingsError: there is no such agent, or its network is another.
+        StorageError: its files are damaged.
+
+    """
+    controller = load_agent(name).controller
+    if controller.network != config.network:
+        raise SettingsError(f"start_from: network must be that of {name}, {controller.network}, got {config.network}")
+    return controller
 
 
 def load_source(folder: Path, config: TrainConfig) -> RunState:

@@ -180,8 +180,8 @@ class Refinement(Stage):
 
     @property
     def rewarded_as_at(self) -> int:
-        """The last update of the phase before."""
-        return self.start - 1
+        """The end of the phase before."""
+        return self.start - 1 if self.start else self.start
 
     def begin_from(self, state: RunState) -> RunState:
         """Go on with the best policy so far; the refined ones are compared with it."""

@@ -56,7 +56,8 @@ def train(
         config: the run's settings (with ``resume``: those that the run began with).
         run: folder of the run; new or empty unless ``resume``.
         resume: go on exactly where the run stopped.
-        start_from: a snapshot (or the checkpoint of another run) whose learner and replay buffer to begin with.
+        start_from: a snapshot (or the checkpoint of another run) whose learner and replay buffer to begin with; where
+            the settings have no updates, the name or folder of an agent to refine.
         progress: show a progress bar on stderr.
         devices: divide the environments and the replay buffer among so many devices of this process.  Several
             processes (see ``runtime.join``) divide them among the devices of all; all get the same arguments and need
@@ -153,7 +154,7 @@ def _begun(folder: RunFolder, config: TrainConfig, start_from: Path | str | None
         yield Checkpoint(state, "")
 
 
-def checked_source(config: TrainConfig, start_from: Path | str | None) -> RunState | None:
+def checked_source(config: TrainConfig, start_from: Path | str | None) -> RunState | PolicyController | None:
     """Refuse a run that cannot be.  Returns what it begins with, where that is another run's.
 
     Raises:
@@ -165,6 +166,10 @@ def checked_source(config: TrainConfig, start_from: Path | str | None) -> RunSta
     check_feasible(config.task, config.eval_max_angle_deg, "eval_max_angle_deg")
     plausibility.check_training(config)
     _check_memory(config)
+    if config.refines_alone:
+        if start_from is None:
+            raise SettingsError("start_from: must name an agent where curriculum has no updates, got none")
+        return checkpoint.load_agent_source(start_from, config)
     return None if start_from is None else checkpoint.load_source(Path(start_from), config)
 
 
@@ -210,6 +215,9 @@ class _Run:
         # The first row of a log names its columns.
         blank = dict.fromkeys(("refine/cost", *_EVAL_NAMES), math.nan)
         done = saved_at = state.done
+        begun_at = stages.after(self.stages, done)
+        if begun_at is not None and begun_at.improves_on_the_one_before and not np.isfinite(state.best_score):
+            state, _ = self._evaluate(state, begun_at, out)  # what is refined must be improved on
         while (stage := stages.after(self.stages, done)) and not processes.any_process(self.shutdown.requested):
             await_program(type(stage).__name__)
             start = time.perf_counter()

@@ -116,6 +116,7 @@ def test_an_empty_training_is_refused():
     content = FAST.model_dump()
     for phase in content["curriculum"].values():
         phase["updates"] = 0
+    content["refine"]["iterations"] = 0
     with pytest.raises(ValidationError, match="at least one update"):
         TrainConfig.model_validate(content)
 

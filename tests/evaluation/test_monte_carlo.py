@@ -256,7 +256,11 @@ def test_the_command_keeps_blocks(tmp_path, capsys, monkeypatch):
     ]
     assert tiny.status("eval_mc", *argv) == 0
     first = json.loads((tmp_path / "x.json").read_text())
-    assert sorted(path.name for path in (tmp_path / "kept").iterdir()) == ["block-0000000000", "lock"]
+    assert sorted(path.name for path in (tmp_path / "kept").iterdir()) == [
+        "block-0000000000",
+        f"block-{BLOCK:010d}",
+        "lock",
+    ]
     assert tiny.status("eval_mc", *argv) == 0
     second = json.loads((tmp_path / "x.json").read_text())
     assert {**first, "compile_s": 0.0} == second

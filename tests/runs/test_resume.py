@@ -139,9 +139,9 @@ def test_start_from_takes_learner_and_buffer(run, tmp_path):
     for source in (run.snapshot("phase1"), run.path):
         expected = state_of(source if source != run.path else run.checkpoints()[0]).train
         with pytest.MonkeyPatch.context() as patch:
-            begun = []
+            begun: list[RunState] = []
 
-            def catch(_: Any, saved: Checkpoint, begun: list[RunState] = begun) -> None:
+            def catch(_: Any, saved: Checkpoint, __: Any, begun: list[RunState] = begun) -> None:
                 begun.append(saved.state)
 
             patch.setattr(trainer._Run, "go", catch)
