@@ -36,7 +36,7 @@ def ship(run: Path, into: Path, name: str | None = None) -> int:
         agent = load_agent(folder)
         flown = monte_carlo(agent, _CASES)
         summary = summarise(flown.results)
-        print(table(summary, _CASES, shipped), end="\n\n")
+        print(table(flown, name=shipped), end="\n\n")
         report = {"cases": _CASES, "seed": flown.config.seed, **dataclasses.asdict(summary)}
         provenance = agent.provenance.model_copy(update={"table": report})
         dataclasses.replace(agent, provenance=provenance).save(into / shipped)
