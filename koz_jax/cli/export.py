@@ -30,7 +30,8 @@ class _FormatFlags(Settings):
     """Folder to write into; the files of an earlier export to the same format are replaced."""
     spacecraft: Path | None = None
     """Of an agent for any spacecraft, the one that it is exported for, and the shield with it: a TOML file with a table
-    [spacecraft] and step_seconds, such as a maneuver file; by default that of the agent's task."""
+    [spacecraft] and step_seconds, such as a maneuver file; by default that of the agent's task.  C knows all of its
+    [[instruments]], the other formats the first."""
     urgency: Urgency | None = Field(default=None, description=URGENCY)
     shield: bool = False
     """Also write the shield, which keeps the boresight out of every zone; for --to c."""
@@ -86,11 +87,16 @@ def _export(asked: ExportFlags) -> int:
     from koz_jax.export.files import export, write_files
     from koz_jax.storage.files import make_folder
 
-    task = None if asked.spacecraft is None else load_spacecraft(asked.spacecraft).task
     agent = load_agent(asked.agent)
+    task, further = None, ()
+    if asked.spacecraft is not None:
+        described = load_spacecraft(asked.spacecraft)
+        task = described.task
+        if asked.to == "c" and agent.controller.network.scaled:
+            further = tuple(instrument.boresight for instrument in described.instruments[1:])
     if asked.urgency is not None:
         agent = agent.with_urgency(asked.urgency)
     make_folder("out", asked.out)
-    for path in write_files(asked.out, export(agent, asked.to, asked.shield_config, task)):
+    for path in write_files(asked.out, export(agent, asked.to, asked.shield_config, task, further)):
         print(path)
     return 0
