@@ -18,7 +18,9 @@ from koz_jax.cli.exit_status import exit_status
 from koz_jax.cli.flags import parsing
 from koz_jax.cli.flags.process import ProcessFlags
 from koz_jax.config.base import CaseCount, PositiveInt
+from koz_jax.config.maneuvers.maneuver_file import load_spacecraft
 from koz_jax.config.presets.named import PRESETS, preset
+from koz_jax.config.presets.spacecraft import for_spacecraft
 from koz_jax.config.training import TrainConfig
 from koz_jax.errors import SettingsError
 
@@ -33,6 +35,9 @@ _HELPS = {"preset": f"Settings to begin from: {', '.join(PRESETS)}; every other 
 class TrainFlags(ProcessFlags):
     """Train a controller that turns a spacecraft without looking into a keep-out zone."""
 
+    spacecraft: Path | None = None
+    """Train for this spacecraft instead of the paper's, times of the preset in its own units: a TOML file with a table
+    [spacecraft] and step_seconds, such as a maneuver file."""
     run: Path | None = None
     """Folder of the run; by default a new one under runs/."""
     resume: Path | None = None
@@ -72,9 +77,13 @@ def parse(argv: Sequence[str]) -> tuple[TrainConfig, TrainFlags]:
     chosen, others = _first_look(argv)
     if chosen.preset is not None:
         others += ["--preset", chosen.preset]
+    if chosen.spacecraft is not None:
+        others += ["--spacecraft", chosen.spacecraft]
     if chosen.resume is not None and others and not {"-h", "--help"} & set(argv):
         raise SettingsError(f"resume: takes all settings from the run; remove {shlex.join(others)}")
     begin_from = preset("fast" if chosen.preset is None else chosen.preset)
+    if chosen.spacecraft:
+        begin_from = for_spacecraft(begin_from, load_spacecraft(chosen.spacecraft).task)
     asked, config = parsing.parse_with(TrainFlags, begin_from, argv, prog, _HELPS)
     return config, asked
 
@@ -83,6 +92,7 @@ def _first_look(argv: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
     """Find what decides how the rest is read, and what a run may also be resumed with; and all the rest."""
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--preset", nargs="?", const="")
+    first.add_argument("--spacecraft", nargs="?", const="")
     first.add_argument("--resume", nargs="?", const="")
     for name in ("cases", "devices", "coordinator", "processes", "process"):
         first.add_argument(f"--{name}", nargs="?")

@@ -8,7 +8,9 @@ import pytest
 from koz_jax.config.base import ramp_value
 from koz_jax.config.curriculum import PhaseConfig
 from koz_jax.config.presets import named as presets
-from koz_jax.config.task import ScenarioConfig
+from koz_jax.config.presets import sizes
+from koz_jax.config.presets.spacecraft import for_spacecraft
+from koz_jax.config.task import ScenarioConfig, TaskConfig
 from koz_jax.config.training import EncodingConfig, TrainConfig
 from koz_jax.errors import SettingsError
 
@@ -157,3 +159,45 @@ def test_an_unknown_preset_names_those_that_exist(name):
         presets.preset(name)
     for known in presets.PRESETS:
         assert known in str(caught.value)
+
+
+# --- for another spacecraft, and on a GPU ---
+
+
+def _twice_as_slow() -> TaskConfig:
+    """The paper's spacecraft with four times its inertia, and a time step twice as long: T is twice as long too."""
+    paper = TaskConfig()
+    heavy = tuple(tuple(4.0 * entry for entry in row) for row in paper.spacecraft.inertia)
+    return TaskConfig.model_validate(
+        {
+            "spacecraft": {"inertia": heavy},
+            "scenario": {"max_rate_deg": paper.scenario.max_rate_deg / 2.0},
+            "step_seconds": 2.0 * paper.step_seconds,
+            "episode_seconds": 2.0 * paper.episode_seconds,
+        }
+    )
+
+
+@pytest.mark.parametrize("name", ["fast", "universal"])
+def test_a_spacecraft_that_is_twice_as_slow_is_trained_over_the_same_steps(name):
+    given, own = presets.preset(name), for_spacecraft(presets.preset(name), _twice_as_slow())
+    assert own.task.spacecraft.time_unit == pytest.approx(2.0 * given.task.spacecraft.time_unit)
+    assert own.training_episode_steps == given.training_episode_steps
+    assert own.refine_steps == given.refine_steps
+    assert own.task.episode_steps == round(given.task.episode_seconds / given.task.step_seconds)
+    assert own.network.scaled and not own.task.spread.spacecraft
+    of_paper = given.network.encoding.rate_scales
+    unit = 1.0 if given.network.scaled else given.task.spacecraft.time_unit
+    assert own.network.encoding.rate_scales == pytest.approx([unit * scale for scale in of_paper])
+
+
+def test_sizes_of_a_gpu_leave_what_was_set_by_hand():
+    fast = presets.preset("fast")
+    sized, changed = sizes.for_gpu(fast)
+    assert sized.sac.batch_size > fast.sac.batch_size and sized.curriculum.updates < fast.curriculum.updates
+    assert changed["sac.batch_size"] == sized.sac.batch_size
+    by_hand = fast.model_copy(update={"num_envs": 64})
+    again, changed = sizes.for_gpu(by_hand)
+    assert again == sized.model_copy(update={"num_envs": 64}) and "num_envs" not in changed
+    for other in ("paper", "smoke"):
+        assert sizes.for_gpu(presets.preset(other)) == (presets.preset(other), {})

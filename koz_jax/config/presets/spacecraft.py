@@ -1,0 +1,30 @@
+"""A training for another spacecraft than the paper's: its times and rates are those of the preset, in units of T."""
+
+from koz_jax.config.task import TaskConfig
+from koz_jax.config.training import TrainConfig
+
+
+def for_spacecraft(config: TrainConfig, task: TaskConfig) -> TrainConfig:
+    """Settings that train for one spacecraft; its policy sees it in its own units and axes.
+
+    task: with the spacecraft, its time step, and maneuvers in its units, as ``SpacecraftFile.task`` gives it.
+    """
+    stretch = task.spacecraft.time_unit / config.task.spacecraft.time_unit
+
+    def stretched(seconds: float) -> float:
+        return max(round(stretch * seconds / task.step_seconds), 1) * task.step_seconds
+
+    network = config.network
+    if not network.scaled:
+        own = config.task.spacecraft.time_unit
+        in_units = tuple(own * scale for scale in network.encoding.rate_scales)
+        encoding = network.encoding.model_copy(update={"rate_scales": in_units})
+        network = network.model_copy(update={"encoding": encoding, "scaled": True})
+    spread = config.task.spread.model_copy(update={"spacecraft": False, "instruments": 1, "keep_in": 0.0})
+    changes = {
+        "task": task.model_copy(update={"spread": spread}),
+        "network": network,
+        "training_episode_seconds": stretched(config.training_episode_seconds),
+        "refine": config.refine.model_copy(update={"horizon_seconds": stretched(config.refine.horizon_seconds)}),
+    }
+    return TrainConfig.model_validate(config.model_copy(update=changes).model_dump())
