@@ -67,6 +67,11 @@ def trials() -> Iterator[Trial]:
     slender = anyone.model_copy(update={"slenderness": (0.05, 0.1)})
     yield Trial("random, slender", TaskConfig(spread=slender))
     yield Trial("random, with errors", TaskConfig(spread=anyone.model_copy(update={**ERRORS})))
+    several = anyone.model_copy(update={"zones": (1, 4)})
+    many = several.model_copy(update={"instruments": 3, "keep_in": 0.2})
+    for spread, title in ((several, "1 to 4 zones"), (many, "1 to 4 zones, 3 instruments")):
+        yield Trial(f"random, {title}", TaskConfig(spread=spread))
+        yield Trial(f"random, {title}, shield", TaskConfig(spread=spread), shielded=True)
     yield Trial("the paper's", TaskConfig(), (0.0, 0.25, 0.5, 0.75, 1.0))
     for limit_deg in (2.0, 5.0, 10.0, 20.0):
         limited = anyone.model_copy(update={"max_rate_deg": (limit_deg, limit_deg)})
