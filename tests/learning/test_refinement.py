@@ -3,6 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from koz_jax import devices
 from koz_jax.config.presets.named import preset
 from koz_jax.config.training import RefineConfig, TrainConfig
 from koz_jax.control.policy import PolicyController, policy_network
@@ -64,8 +65,10 @@ def test_the_gradient_is_that_of_the_whole_maneuver(policy):
 
 
 @pytest.mark.slow
-def test_gradients_of_maneuvers_that_no_bound_clips_have_the_mean_of_the_whole(policy):
+@pytest.mark.parametrize("on_gpu", [False, True])
+def test_gradients_of_maneuvers_that_no_bound_clips_have_the_mean_of_the_whole(policy, on_gpu, monkeypatch):
     """Taken over the actions first and the weights after, they are the gradient of the mean cost."""
+    monkeypatch.setattr(devices, "on_gpu", lambda: on_gpu)
     unclipped = CONFIG.refine.model_copy(update={"max_maneuver_gradient": 1e9})
 
     @jax.jit
