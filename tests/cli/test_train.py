@@ -22,7 +22,9 @@ from koz_jax.agents.agent import load_agent
 from koz_jax.cli import train as train_cli
 from koz_jax.cli.train import TrainFlags, parse
 from koz_jax.config.base import Settings
+from koz_jax.config.maneuvers.maneuver_file import load_spacecraft
 from koz_jax.config.presets.named import PRESETS, preset
+from koz_jax.config.presets.spacecraft import for_spacecraft
 from koz_jax.config.training import TrainConfig
 from koz_jax.learning import train_step
 from koz_jax.runs import checkpoint, memory
@@ -97,6 +99,8 @@ BAD = [
     ("--resume .", ["resume: . is not a run folder (it has no config.json)"]),
     ("--resume", ["--resume"]),
     (f"--resume {'x' * 300}", ["resume: xxx", "is not a run folder"]),
+    ("--spacecraft nowhere.toml", ["spacecraft: nowhere.toml cannot be read"]),
+    ("--spacecraft", ["--spacecraft"]),
     ("--start-from nowhere", ["start_from: nowhere is neither a run with a checkpoint nor a snapshot"]),
 ]
 
@@ -161,7 +165,16 @@ def test_a_run_folder_that_cannot_be_made_is_named(capsys, empty_cwd):
 
 @pytest.mark.parametrize(
     "others",
-    ["--seed 3", "--preset paper", "--preset=fast", "--run other", "--start-from other", "--num-envs=4", "--preset"],
+    [
+        "--seed 3",
+        "--preset paper",
+        "--spacecraft mine.toml",
+        "--preset=fast",
+        "--run other",
+        "--start-from other",
+        "--num-envs=4",
+        "--preset",
+    ],
 )
 @pytest.mark.usefixtures("no_training")
 def test_resume_takes_no_other_settings(capsys, run, empty_cwd, others):
@@ -392,3 +405,12 @@ def test_trim_removes_what_only_a_resume_needs(run, tmp_path, capsys):
     assert tiny.status("trim", tmp_path) == 2
     assert "run: " in (told := capsys.readouterr().err) and "is not a run folder" in told
     assert tiny.status("trim") == 2
+
+
+def test_another_spacecraft_comes_from_a_file_and_flags_change_what_it_gives():
+    file = tiny.ROOT / "examples" / "cubesat_6u.toml"
+    config, _ = parse(["--spacecraft", str(file), "--refine.iterations", "7"])
+    assert config == for_spacecraft(preset("fast"), load_spacecraft(file).task).model_copy(
+        update={"refine": config.refine}
+    )
+    assert config.refine.iterations == 7 and config.network.scaled
