@@ -195,7 +195,9 @@ def _train_seeds(config: TrainConfig, asked: TrainFlags, run: Path, command: str
         if getattr(asked, name) > 1:
             raise SettingsError(f"{name}: must be 1 for several seeds, as in {run}; got {getattr(asked, name)}")
     if asked.resume is None:
-        start_from = None if asked.start_from is None else str(asked.start_from.resolve())
+        source = asked.start_from
+        # The workers are in another folder; an agent may also be named.
+        start_from = None if source is None else str(source.resolve() if source.exists() else source)
         plan = seeds.Plan(config=config, seeds=asked.seeds, start_from=start_from, cases=asked.cases or _CASES)
         seeds.begin(run, plan)
     else:
