@@ -1,14 +1,14 @@
 """Agents and classical controllers over the same cases, with and without the shield: one table.
 
-    python benchmarks/rivals.py [--zones N] [--cases N] [--json FILE] [--markdown FILE]
+    python benchmarks/rivals.py [--zones N] [--cases N] [--only NAME ...] [--markdown FILE]
 
-Zones are checked at five instants per time step.  The time per decision is that of one maneuver alone, on one core.
+The file is written after each row, and keeps the rows of others.  Zones are checked at five instants per time step.
+The time per decision is that of one maneuver alone, on one core.
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import sys
 import time
 from pathlib import Path
@@ -25,25 +25,18 @@ from koz_jax.config.task import TaskConfig
 from koz_jax.control.base import Controller, Memoryless, TaskController
 from koz_jax.control.registry import ADVERSARIAL, CLASSICAL, load_controller
 from koz_jax.evaluation import cases, rollout
-from koz_jax.evaluation.summary import Summary, summarise
-from koz_jax.storage import files, runtime
+from koz_jax.evaluation.summary import summarise
+from koz_jax.storage import runtime
 from koz_jax.task import scenario
 from koz_jax.task.state import EnvState, Model
 
 SUBSTEPS = 5
 
-
-@dataclasses.dataclass(frozen=True)
-class Row:
-    """One controller of the table."""
-
-    name: str
-    shielded: bool
-    summary: Summary
-    decision_us: float
+# What a controller flies under: nothing, or the shield.
+FILTERS = ("-", "shield")
 
 
-COLUMNS = (
+FIGURES = (
     ("mean reward", lambda s: f"{s.mean_reward:.0f} ± {s.std_reward:.0f}"),
     ("settling time [s]", lambda s: f"{s.settling_time_mean:.2f} ± {s.settling_time_std:.2f}"),
     ("effort [N² m² s]", lambda s: f"{s.control_effort_mean:.1f} ± {s.control_effort_std:.1f}"),
@@ -83,21 +76,18 @@ class _Idle(Memoryless):
         return jnp.zeros(3), memory
 
 
-def evaluate(flown: TaskController, task: TaskConfig, count: int, shield: ShieldConfig | None) -> Row:
-    """Fly a controller over the cases and time it."""
+def fly(flown: TaskController, task: TaskConfig, count: int, shield: ShieldConfig | None) -> list[str]:
+    """Fly a controller over the cases, and time it.  Returns its row."""
     config = MonteCarloConfig(cases=count, substeps=SUBSTEPS, shield=shield)
     summary = summarise(cases.fly_cases(flown.controller, task, config))
-    return Row(flown.name, shield is not None, summary, decision_us(flown.controller, task, shield))
-
-
-def markdown(rows: list[Row]) -> str:
-    """The table, a row per controller."""
-    head = ["", *(name for name, _ in COLUMNS), "decision [us]"]
-    lines = [head, ["---"] * len(head)]
-    for row in rows:
-        name = f"{row.name} + shield" if row.shielded else row.name
-        lines.append([name, *(show(row.summary) for _, show in COLUMNS), f"{row.decision_us:.1f}"])
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    decision = decision_us(flown.controller, task, shield)
+    return [
+        flown.name,
+        FILTERS[shield is not None],
+        str(count),
+        *(show(summary) for _, show in FIGURES),
+        f"{decision:.1f}",
+    ]
 
 
 def main(argv: list[str]) -> int:
@@ -107,30 +97,26 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--cases", type=int, default=10_000)
     parser.add_argument("--adversarial", action="store_true", help="also the controllers that try the shield")
     parser.add_argument("--only", nargs="*", help="names of the controllers; by default all")
-    parser.add_argument("--json", type=Path, help="write the rows as JSON")
-    parser.add_argument("--markdown", type=Path, help="write the table with its origin, for docs/results/")
+    parser.add_argument("--markdown", type=Path, help="write the table, or add to it, for docs/results/")
     args = parser.parse_args(argv)
-    return exit_status(lambda: _compare(args, argv))
+    return exit_status(lambda: _compare(args))
 
 
-def _compare(args: argparse.Namespace, argv: list[str]) -> int:
+def _compare(args: argparse.Namespace) -> int:
     runtime.configure()
     agents = ["zones3"] if args.zones > 1 else ["phase2", "phase2-sac", "zones3"]
+    everybody = [*agents, *CLASSICAL, *ADVERSARIAL]
     names = args.only or [*agents, *CLASSICAL, *(ADVERSARIAL if args.adversarial else ())]
-    rows = []
+    order = [(name, under) for name in dict.fromkeys([*everybody, *names]) for under in FILTERS]
+    columns = ("controller", "under", "cases", *(name for name, _ in FIGURES), "decision [us]")
+    program = "benchmarks/rivals.py" + (f" --zones {args.zones}" if args.zones > 1 else "")
+    table = stamp.GrowingTable(args.markdown, program, columns, order)
     for name in names:
         untrained = name in (*CLASSICAL, *ADVERSARIAL)
         flown = load_controller(name) if untrained else load_agent(name)
         task = flown.task.with_rules(zones=args.zones)
         for shield in (None, ShieldConfig()):
-            rows.append(evaluate(flown, task, args.cases, shield))
-            print(markdown(rows[-1:]).splitlines()[-1], flush=True)
-    table = markdown(rows)
-    print(f"\n{args.cases} cases, zones per case: {args.zones}\n\n{table}")
-    if args.json:
-        files.write_json(args.json, {"rows": [dataclasses.asdict(row) for row in rows]})
-    if args.markdown:
-        stamp.write_table(args.markdown, ["benchmarks/rivals.py", *argv], table)
+            table.add(fly(flown, task, args.cases, shield))
     return 0
 
 
