@@ -6,6 +6,7 @@ run's result is taken, under that name.
 
 import argparse
 import dataclasses
+import re
 import sys
 from pathlib import Path
 
@@ -18,6 +19,9 @@ from koz_jax.evaluation.summary import summarise, table
 from koz_jax.storage import archive, runtime
 
 _CASES = 10_000
+
+# Where a run was on the machine that made it is nobody's business.
+_run_folder = re.compile(r"(--run[ =])(\S+)")
 
 
 def ship(run: Path, into: Path, name: str | None = None) -> int:
@@ -38,7 +42,8 @@ def ship(run: Path, into: Path, name: str | None = None) -> int:
         summary = summarise(flown.results)
         print(table(flown, name=shipped), end="\n\n")
         report = {"cases": _CASES, "seed": flown.config.seed, **dataclasses.asdict(summary)}
-        provenance = agent.provenance.model_copy(update={"table": report})
+        command = _run_folder.sub(rf"\g<1>runs/{run.name}", agent.provenance.command)
+        provenance = agent.provenance.model_copy(update={"table": report, "command": command})
         dataclasses.replace(agent, provenance=provenance).save(into / shipped)
     return 0
 
