@@ -21,7 +21,7 @@ from koz_jax.storage import archive, runtime
 _CASES = 10_000
 
 # Where a run was on the machine that made it is nobody's business.
-_run_folder = re.compile(r"(--run[ =])(\S+)")
+_RUN_FOLDER = re.compile(r"(--run[ =])(\S+)")
 
 
 def ship(run: Path, into: Path, name: str | None = None) -> int:
@@ -42,7 +42,7 @@ def ship(run: Path, into: Path, name: str | None = None) -> int:
         summary = summarise(flown.results)
         print(table(flown, name=shipped), end="\n\n")
         report = {"cases": _CASES, "seed": flown.config.seed, **dataclasses.asdict(summary)}
-        command = _run_folder.sub(rf"\g<1>runs/{run.name}", agent.provenance.command)
+        command = _RUN_FOLDER.sub(rf"\g<1>runs/{run.name}", agent.provenance.command)
         provenance = agent.provenance.model_copy(update={"table": report, "command": command})
         dataclasses.replace(agent, provenance=provenance).save(into / shipped)
     return 0

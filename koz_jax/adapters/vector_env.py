@@ -206,7 +206,7 @@ class NumpyVectorEnv:
                 f"rate_deg: must be at most {np.rad2deg(fastest):.6g} deg/s about each axis, the observation's bound"
                 f" for this task, got {np.rad2deg(asked.initial.omega_BN_B).tolist()}"
             )
-        return _filled_up(asked, self.task.scenario.max_zones)
+        return _filled_up(asked, self.task.zones[1])
 
     def step(self, actions: npt.ArrayLike) -> VectorStep:
         """Step every environment.  actions: (n, 3) in [-1, 1] (clipped).  Returns NumPy leaves (n, ...)."""

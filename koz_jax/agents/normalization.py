@@ -109,7 +109,7 @@ def fold(
 
     kernel: (entries, outputs); bias: (outputs,).  Returns the same, float64.
     """
-    where = slices(task.scenario.max_zones)["boresight_B"]
+    where = slices(task.zones[1])["boresight_B"]
     kernel, bias = np.asarray(kernel, np.float64), np.asarray(bias, np.float64)
     looks = np.zeros(len(kernel))
     looks[where] = task.spacecraft.boresight
@@ -125,7 +125,7 @@ def _tell_of_clipping(normalization: Normalization, task: TaskConfig) -> None:
     lowest, highest = normalization.mean - reach, normalization.mean + reach
     low, high = observation_bounds(task)
     lost = []
-    for name, part in slices(task.scenario.max_zones).items():
+    for name, part in slices(task.zones[1]).items():
         if name != "boresight_B" and np.any((low[part] < lowest[part]) | (high[part] > highest[part])):
             lost.append(f"{name} below {lowest[part].max():.3g} or above {highest[part].min():.3g}")
     if lost:

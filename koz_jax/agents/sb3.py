@@ -52,7 +52,7 @@ def read_sb3(
             its observations were normalised and there are no statistics, or the other way round.
 
     """
-    zones = task.scenario.max_zones
+    zones = task.zones[1]
     statistics = None if normalization is None else read_normalization(normalization, zones)
     weights, settings = _read(Path(path), task)
     # Layers are numbered together with the activations between them.

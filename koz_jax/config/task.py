@@ -203,6 +203,7 @@ class TaskConfig(Settings):
             changed["scenario"]["infeasible_zone"] = infeasible_zone
         if zones is not None:
             changed["scenario"] |= {"min_zones": zones, "max_zones": zones}
+            changed["spread"]["zones"] = None
         if max_rate_deg is not None:
             changed["scenario"]["max_rate_deg"] = max_rate_deg
         return TaskConfig.model_validate(changed)

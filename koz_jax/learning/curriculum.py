@@ -45,7 +45,8 @@ def reward_params(at: Difficulty, params: RewardParams) -> RewardParams:
 
 
 def _phase_difficulty(phase: PhaseConfig, number: int, update: jax.Array) -> Difficulty:
-    fraction = jnp.clip(update / max(phase.updates, 1), 0.0, 1.0)
+    # A phase of no length is at its end.
+    fraction = jnp.clip(update / phase.updates, 0.0, 1.0) if phase.updates else 1.0
 
     def value(ramp: Ramp) -> jax.Array:
         fractions, values = np.array(ramp, np.float32).T

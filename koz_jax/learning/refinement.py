@@ -33,7 +33,7 @@ from koz_jax.task.state import EnvState, largest_rate
 
 Tree = TypeVar("Tree")
 
-# Maneuvers whose gradients in the weights are taken at once: few fit the cache of a CPU, many fill a GPU.
+# Maneuvers whose gradients in the weights are taken at once on a GPU; on a CPU, one after the other fits its cache.
 _TOGETHER_ON_GPU = 256
 
 # Share of the rate limit from which a rate costs something, and how fast that grows.
@@ -224,7 +224,7 @@ def _clipped_gradient(
         return _clipped(pull(slopes)[0], config.refine.max_maneuver_gradient)
 
     costs, observed, slopes = jax.vmap(action_slopes)(keys)
-    together = min(_TOGETHER_ON_GPU if devices.on_gpu() else 1, config.refine.scenarios)
+    together = _TOGETHER_ON_GPU if devices.on_gpu() else None
     gradients = jax.lax.map(weight_gradient, (observed, slopes), batch_size=together)
     return jnp.mean(costs), jax.tree.map(lambda leaf: jnp.mean(leaf, axis=0), gradients)
 

@@ -181,7 +181,7 @@ class Refinement(Stage):
     @property
     def rewarded_as_at(self) -> int:
         """The end of the phase before."""
-        return self.start - 1 if self.start else self.start
+        return max(self.start - 1, 0)
 
     def begin_from(self, state: RunState) -> RunState:
         """Go on with the best policy so far; the refined ones are compared with it."""

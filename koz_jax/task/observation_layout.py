@@ -182,7 +182,7 @@ def observation_bounds(task: TaskConfig) -> tuple[npt.NDArray[np.float32], npt.N
         "zone_angle": np.pi,
         "zone_margin": np.pi - ABSENT_HALF_ANGLE,
     }
-    zones = task.scenario.max_zones
+    zones = task.zones[1]
     high = np.ones(size(zones))
     for name, part in slices(zones).items():
         # Further zones have a number in front of the name.

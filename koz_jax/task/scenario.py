@@ -111,12 +111,13 @@ def _draw(key: jax.Array, ranges: ScenarioRanges, angle: jax.Array | None = None
     )
 
 
-def _full_half_angle(draw: _Draw, ranges: ScenarioRanges) -> jax.Array:
-    return ranges.min_half_angle + (ranges.max_half_angle - ranges.min_half_angle) * draw.size
+def _full_half_angle(size: jax.Array, ranges: ScenarioRanges) -> jax.Array:
+    """Half angle of a size () in [0, 1].  Returns () [rad]."""
+    return ranges.min_half_angle + (ranges.max_half_angle - ranges.min_half_angle) * size
 
 
 def _is_feasible(draw: _Draw, ranges: ScenarioRanges) -> jax.Array:
-    return draw.room >= _full_half_angle(draw, ranges) + ranges.separation
+    return draw.room >= _full_half_angle(draw.size, ranges) + ranges.separation
 
 
 def _shrunk_half_angle(draw: _Draw, ranges: ScenarioRanges) -> jax.Array:
@@ -144,7 +145,7 @@ def sample(key: jax.Array, ranges: ScenarioRanges, rule: SamplingRule = Sampling
 
         _, draw = jax.lax.while_loop(infeasible, again, (jnp.int32(1), first))
         half_angle = jnp.where(
-            _is_feasible(draw, ranges), _full_half_angle(draw, ranges), _shrunk_half_angle(draw, ranges)
+            _is_feasible(draw, ranges), _full_half_angle(draw.size, ranges), _shrunk_half_angle(draw, ranges)
         )
     zones = PointingConstraint(ranges.boresight_B[None], draw.zone_axis_D[None], half_angle[None])
     if ranges.max_zones > 1:
@@ -164,10 +165,9 @@ class _Pair(NamedTuple):
     midway_D: jax.Array  # (3,) the half of the sphere around this direction is where it lies
 
 
-def _pair(key: jax.Array, ranges: ScenarioRanges, q_e: jax.Array, first: PointingConstraint) -> _Pair:
-    """Draw for which instrument a further zone is, and of what size."""
-    size = jax.random.uniform(jax.random.split(key)[1])
-    half_angle = ranges.min_half_angle + (ranges.max_half_angle - ranges.min_half_angle) * size
+def _pair(key: jax.Array, size: jax.Array, ranges: ScenarioRanges, q_e: jax.Array, first: PointingConstraint) -> _Pair:
+    """Draw for which instrument a further zone of a size () in [0, 1] is."""
+    half_angle = _full_half_angle(size, ranges)
     if ranges.others_B is None:
         return _Pair(ranges.boresight_B, half_angle, first.axis_N[0])
     key_which, key_kind = jax.random.split(jax.random.fold_in(key, _INSTRUMENT))
@@ -184,7 +184,9 @@ def _pair(key: jax.Array, ranges: ScenarioRanges, q_e: jax.Array, first: Pointin
 
 
 def _add_zones(key: jax.Array, ranges: ScenarioRanges, q_e: jax.Array, first: PointingConstraint) -> PointingConstraint:
-    """Put further zones within 90 deg of the first, as many as are drawn and as find a place.
+    """Put further zones in the way, as many as are drawn and as find a place.
+
+    Each lies within 90 deg of where its instrument looks midway, a cone to keep it in with its opposite.
 
     q_e: (4,) attitude at the start, relative to the target; first: leaves (1, ...).  Returns leaves (max_zones, ...).
     """
@@ -193,10 +195,11 @@ def _add_zones(key: jax.Array, ranges: ScenarioRanges, q_e: jax.Array, first: Po
     to_all = jax.vmap(rotations.angle_between, in_axes=(None, 0))
 
     def add(i: jax.Array, zones: PointingConstraint) -> PointingConstraint:
-        pair = _pair(keys[i], ranges, q_e, first)
+        key_axis, key_size = jax.random.split(keys[i])
+        pair = _pair(keys[i], jax.random.uniform(key_size), ranges, q_e, first)
         looks_D = jnp.stack([pair.boresight_B, rotations.rotate(q_e, pair.boresight_B)])
-        axes = jax.vmap(rotations.normalize)(jax.random.normal(jax.random.split(keys[i])[0], (_PLACES, 3)))
-        # Mirrored into the half of the sphere.
+        axes = jax.vmap(rotations.normalize)(jax.random.normal(key_axis, (_PLACES, 3)))
+        # Mirrored into the half of the sphere around that.
         axes = axes * jnp.where(axes @ pair.midway_D < 0.0, -1.0, 1.0)[:, None]
         clear = jax.vmap(to_all, in_axes=(0, None))(axes, looks_D) >= pair.half_angle + ranges.separation
         room = pair.half_angle + zones.half_angle + ranges.zone_gap

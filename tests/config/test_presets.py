@@ -186,6 +186,10 @@ def test_a_spacecraft_that_is_twice_as_slow_is_trained_over_the_same_steps(name)
     assert own.refine_steps == given.refine_steps
     assert own.task.episode_steps == round(given.task.episode_seconds / given.task.step_seconds)
     assert own.network.scaled and not own.task.spread.spacecraft
+    limits = given.task.spread.max_rate_deg
+    assert own.task.spread.max_rate_deg == (limits and tuple(pytest.approx(limit / 2.0) for limit in limits))
+    assert own.task.spread.errors.rate_noise_deg == pytest.approx(given.task.spread.errors.rate_noise_deg / 2.0)
+    assert own.task.spread.errors.disturbance_torque == given.task.spread.errors.disturbance_torque
     of_paper = given.network.encoding.rate_scales
     unit = 1.0 if given.network.scaled else given.task.spacecraft.time_unit
     assert own.network.encoding.rate_scales == pytest.approx([unit * scale for scale in of_paper])

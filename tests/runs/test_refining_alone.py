@@ -1,14 +1,18 @@
 """Runs that only refine an agent that there is already."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny
 from support.tiny import CONFIG
 
 from koz_jax.agents.agent import load_agent
+from koz_jax.config.presets.named import preset
 from koz_jax.config.training import TrainConfig
 from koz_jax.errors import SettingsError
+from koz_jax.learning import curriculum
+from koz_jax.runs import stages
 from koz_jax.runs.folder import RunFolder
 from koz_jax.runs.trainer import train
 
@@ -47,6 +51,20 @@ def test_it_goes_on_to_the_same_bits(run, tmp_path):
     train(ALONE, folders[1].path, resume=True, progress=False)
     for one, two in zip(*(_leaves(folder.path) for folder in folders), strict=True):
         np.testing.assert_array_equal(one, two)
+
+
+def test_the_best_is_chosen_by_the_weights_at_the_end_of_the_curriculum():
+    whole = preset("fast")
+    alone = whole.model_dump()
+    for phase in alone["curriculum"].values():
+        phase["updates"] = 0
+    weights = []
+    for config in (whole, TrainConfig.model_validate(alone)):
+        last = stages.plan(config)[-1]
+        at = curriculum.difficulty(config.curriculum, jnp.int32(last.rewarded_as_at))
+        weights.append(curriculum.reward_weights(at))
+    for one, two in zip(*map(jax.tree.leaves, weights), strict=True):
+        np.testing.assert_allclose(one, two, rtol=1e-4)
 
 
 def test_without_an_agent_or_with_another_network_there_is_nothing_to_refine(run, tmp_path):

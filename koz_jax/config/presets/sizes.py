@@ -40,7 +40,7 @@ _THOROUGH: Sizes = {
 _UNIVERSAL: Sizes = {
     **_LEARNING,
     "refine.scenarios": 2048,
-    "refine.iterations": 3000,
+    "refine.iterations": 2700,
     "eval_every": 32_000,
     "eval_cases": 4000,
     "refine_eval_every": 500,

@@ -1,7 +1,29 @@
 """A training for another spacecraft than the paper's: its times and rates are those of the preset, in units of T."""
 
+from typing import Any
+
+from koz_jax.config.spread import SpreadConfig
 from koz_jax.config.task import TaskConfig
 from koz_jax.config.training import TrainConfig
+
+
+def _spread(given: TaskConfig, task: TaskConfig) -> SpreadConfig:
+    """What a preset spreads, but for the spacecraft, in units of one."""
+    stretch = task.spacecraft.time_unit / given.spacecraft.time_unit
+    strength = task.spacecraft.strength / given.spacecraft.strength
+    spread, errors = given.spread, given.spread.errors
+    changes: dict[str, Any] = {"spacecraft": False, "instruments": 1, "keep_in": 0.0}
+    if spread.max_rate_deg is not None:
+        slowest, fastest = spread.max_rate_deg
+        changes["max_rate_deg"] = (slowest / stretch, fastest / stretch)
+    changes["errors"] = errors.model_copy(
+        update={
+            "disturbance_torque": errors.disturbance_torque * strength,
+            "rate_noise_deg": errors.rate_noise_deg / stretch,
+            "rate_bias_deg": errors.rate_bias_deg / stretch,
+        }
+    )
+    return spread.model_copy(update=changes)
 
 
 def for_spacecraft(config: TrainConfig, task: TaskConfig) -> TrainConfig:
@@ -20,9 +42,8 @@ def for_spacecraft(config: TrainConfig, task: TaskConfig) -> TrainConfig:
         in_units = tuple(own * scale for scale in network.encoding.rate_scales)
         encoding = network.encoding.model_copy(update={"rate_scales": in_units})
         network = network.model_copy(update={"encoding": encoding, "scaled": True})
-    spread = config.task.spread.model_copy(update={"spacecraft": False, "instruments": 1, "keep_in": 0.0})
     changes = {
-        "task": task.model_copy(update={"spread": spread}),
+        "task": task.model_copy(update={"spread": _spread(config.task, task)}),
         "network": network,
         "training_episode_seconds": stretched(config.training_episode_seconds),
         "refine": config.refine.model_copy(update={"horizon_seconds": stretched(config.refine.horizon_seconds)}),
