@@ -26,7 +26,7 @@ BUILT_IN = {
     "pd": BuiltIn("quaternion_feedback", "QuaternionFeedback"),
     "potential": BuiltIn("potential", "PotentialFeedback"),
     "sliding": BuiltIn("sliding_mode", "PotentialSliding"),
-    "planner": BuiltIn("path_planner", "PathPlanner"),
+    "planner": BuiltIn("planning.path_planner", "PathPlanner"),
     "random": BuiltIn("adversarial", "Random", adversarial=True),
     "bang_bang": BuiltIn("adversarial", "BangBang", adversarial=True),
     "adversary": BuiltIn("adversarial", "Adversary", adversarial=True),

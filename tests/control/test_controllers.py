@@ -11,7 +11,7 @@ from koz_jax.config.task import TaskConfig
 from koz_jax.control import registry
 from koz_jax.control.adversarial import Adversary, BangBang, Random, SpinUp
 from koz_jax.control.base import Controller
-from koz_jax.control.path_planner import PathPlanner
+from koz_jax.control.planning.path_planner import PathPlanner
 from koz_jax.control.potential import PotentialFeedback
 from koz_jax.control.quaternion_feedback import QuaternionFeedback
 from koz_jax.control.sliding_mode import PotentialSliding

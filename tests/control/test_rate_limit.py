@@ -10,7 +10,7 @@ from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.spread import SpreadConfig
 from koz_jax.config.task import TaskConfig
 from koz_jax.control.base import Memoryless
-from koz_jax.control.path_planner import PathPlanner
+from koz_jax.control.planning.path_planner import PathPlanner
 from koz_jax.control.shield.filter import under_shield
 from koz_jax.evaluation.rollout import run_case
 from koz_jax.task import dynamics

@@ -8,8 +8,8 @@ from support.states import LOOK, MODEL
 
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.task import TaskConfig
-from koz_jax.control import attitude_path
-from koz_jax.control.path_planner import PathPlanner
+from koz_jax.control.planning import attitude_path
+from koz_jax.control.planning.path_planner import PathPlanner
 from koz_jax.evaluation import cases
 from koz_jax.task import rotations
 from koz_jax.task.actuators import TorqueBox

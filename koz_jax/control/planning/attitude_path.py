@@ -1,13 +1,15 @@
-"""Attitude paths: an eigen-axis turn bent aside, and how fast the torque box lets it be flown.
+"""Attitude paths: an eigen-axis turn bent aside, and how fast the torque box lets a path be flown.
 
-A path is q(s) = q_end (x) exp(bend(s)) (x) exp((s - 1) turn) for s from 0 to 1, with the bend a sum of sines that
-vanishes at both ends: without rounding at its end, where the body will stay.  Its timing is the fastest that keeps the
-torque in its box, with rest at both ends: a backward pass for the rates from which one can still stop, then a forward
-pass along the limit (H. Pham, Q.-C. Pham, "A new approach to time-optimal path parameterization based on reachability
-analysis", IEEE Transactions on Robotics 34 (2018)).
+The bent turn is q(s) = q_end (x) exp(bend(s)) (x) exp((s - 1) turn) for s from 0 to 1, with the bend a sum of sines
+that vanishes at both ends: without rounding at its end, where the body will stay.  The timing of any path is the
+fastest that keeps the torque in its box, with rest at both ends: a backward pass for the rates from which one can still
+stop, then a forward pass along the limit (H. Pham, Q.-C. Pham, "A new approach to time-optimal path parameterization
+based on reachability analysis", IEEE Transactions on Robotics 34 (2018)).
 """
 
+import functools
 import itertools
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +21,16 @@ from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.pointing_constraints import PointingConstraint
 
 
+class Path(Protocol):
+    """Attitudes q(s) from the start, at s = 0, to the target, at s = 1; implementations are pytrees."""
+
+    def attitude(self, s: jax.Array) -> jax.Array:
+        """q(s).  s: () in [0, 1].  Returns (4,), continuous also in its sign."""
+        ...
+
+
 class AttitudePath(struct.PyTreeNode):
-    """A path without timing."""
+    """An eigen-axis turn bent aside, without timing."""
 
     q_end: jax.Array  # (4,) attitude at its end, relative to inertial
     turn_B: jax.Array  # (3,) [rad] rotation vector from start to end
@@ -32,11 +42,6 @@ class AttitudePath(struct.PyTreeNode):
         bend_B = jnp.sum(sines[:, None] * self.bends_B, axis=0)
         aside = rotations.multiply(self.q_end, feedback.from_rotation_vector(bend_B))
         return rotations.multiply(aside, feedback.from_rotation_vector((s - 1.0) * self.turn_B))
-
-    def attitude_and_slope(self, s: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """q(s) (4,), and the body rate (3,) [rad] per unit of s."""
-        q, slope = jax.jvp(self.attitude, (s,), (jnp.ones_like(s),))
-        return q, 2.0 * rotations.multiply(rotations.conjugate(q), slope)[1:]
 
 
 class Timing(struct.PyTreeNode):
@@ -71,9 +76,15 @@ class Samples(struct.PyTreeNode):
     slope_B: jax.Array  # (points, 3) [rad] body rate per unit of s
 
 
-def sample(path: AttitudePath, points: int) -> Samples:
+def attitude_and_slope(path: Path, s: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """q(s) (4,), and the body rate (3,) [rad] per unit of s."""
+    q, slope = jax.jvp(path.attitude, (s,), (jnp.ones_like(s),))
+    return q, 2.0 * rotations.multiply(rotations.conjugate(q), slope)[1:]
+
+
+def sample(path: Path, points: int) -> Samples:
     """Sample a path at so many points, both ends included."""
-    return Samples(*jax.vmap(path.attitude_and_slope)(jnp.linspace(0.0, 1.0, points)))
+    return Samples(*jax.vmap(functools.partial(attitude_and_slope, path))(jnp.linspace(0.0, 1.0, points)))
 
 
 def clearance(samples: Samples, zones: PointingConstraint, timing: Timing) -> jax.Array:

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from koz_jax.control import attitude_path
-from koz_jax.control.attitude_path import AttitudePath
+from koz_jax.control.planning import attitude_path
+from koz_jax.control.planning.attitude_path import AttitudePath
 
 MOMENTS = (60.0, 50.0, 70.0)
 
