@@ -25,7 +25,16 @@ from koz_jax.evaluation.maneuver import config_of, fly_closely, scenario
 from koz_jax.storage import runtime
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
-CONTROLLERS = ("universal", "planner", "potential", "sliding", "pd")
+CONTROLLERS = (
+    "universal",
+    "planner",
+    "potential",
+    "sliding",
+    "pd",
+    "lee_mesbahi_pd",
+    "lee_mesbahi_backstepping",
+    "yang_sliding",
+)
 COLUMNS = ("case", "controller", "settling time [s]", "effort [N² m² s]", "smallest margin [deg]", "verdict")
 
 

@@ -1,0 +1,1 @@
+"""Classical controllers as their papers have them, with the papers' gains."""
