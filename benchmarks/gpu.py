@@ -27,8 +27,7 @@ from koz_jax.config.presets import sizes
 from koz_jax.config.presets.named import preset
 from koz_jax.config.training import TrainConfig
 from koz_jax.evaluation.monte_carlo import run_cases
-from koz_jax.learning import refinement, train_step
-from koz_jax.sac import learner
+from koz_jax.learning import learners, refinement, train_step
 from koz_jax.storage import runtime
 from koz_jax.task.environment import Reorientation
 from koz_jax.task.state import EnvState
@@ -93,7 +92,7 @@ def learning(config: TrainConfig) -> str:
 
 def refining(config: TrainConfig) -> str:
     """Iterations of refinement."""
-    policy = learner.init(train_step.make_sac(config), jax.random.key(0)).policy
+    policy = learners.make_sac(config).init(jax.random.key(0)).policy
     state = refinement.init(config, policy)
     return f"{1e3 * seconds_of_each(refinement.refine_chunk, config, state, 2, 10):.0f} ms an iteration"
 

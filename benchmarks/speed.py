@@ -27,7 +27,7 @@ from koz_jax.config.task import TaskConfig
 from koz_jax.config.training import NetworkConfig
 from koz_jax.control.policy import PolicyController, policy_network
 from koz_jax.evaluation.monte_carlo import run_cases
-from koz_jax.learning import train_step
+from koz_jax.learning import learners
 from koz_jax.sac import learner
 from koz_jax.sac.losses import Batch
 from koz_jax.storage import runtime
@@ -159,13 +159,13 @@ def update(name: str, sac: learner.Sac, batch_size: int, rate: float) -> None:
     batches = Batch(observed, jnp.zeros((*shape, 3)), jnp.zeros(shape), jnp.ones(shape), observed)
 
     @jax.jit
-    def loop(state: learner.LearnerState, batches: Batch, keys: jax.Array) -> learner.LearnerState:
-        def body(state: learner.LearnerState, inputs: tuple[Batch, jax.Array]) -> tuple[learner.LearnerState, None]:
-            return learner.update(sac, state, *inputs, jnp.float32(1e-4))[0], None
+    def loop(state: learner.SacState, batches: Batch, keys: jax.Array) -> learner.SacState:
+        def body(state: learner.SacState, inputs: tuple[Batch, jax.Array]) -> tuple[learner.SacState, None]:
+            return sac.update(state, *inputs, jnp.float32(1e-4))[0], None
 
         return jax.lax.scan(body, state, (batches, keys))[0]
 
-    state, keys = learner.init(sac, key), jax.random.split(key, UPDATES)
+    state, keys = sac.init(key), jax.random.split(key, UPDATES)
     seconds = best_seconds(lambda: loop(state, batches, keys)) / UPDATES
     shapes = update_matmuls(sac, batch_size)
     alone = {shape: matmul_seconds(shape) for shape in set(shapes)}
@@ -207,8 +207,8 @@ def main() -> None:
         monte_carlo(hidden, rate)
     environment()
     paper, fast = preset("paper"), preset("fast")
-    update("paper (256-256, batch 256)", train_step.make_sac(paper), paper.sac.batch_size, rate)
-    update("fast (128-128, batch 256)", train_step.make_sac(fast), fast.sac.batch_size, rate)
+    update("paper (256-256, batch 256)", learners.make_sac(paper), paper.sac.batch_size, rate)
+    update("fast (128-128, batch 256)", learners.make_sac(fast), fast.sac.batch_size, rate)
     first_update()
 
 

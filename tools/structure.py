@@ -18,8 +18,20 @@ ROOT = Path(__file__).resolve().parent.parent / PACKAGE
 # A folder (or a module beside them) imports from itself and from what stands before it.  The last is the package's own
 # face: its ``__init__`` and ``__main__``, which nothing may import.
 FLOORS = (
-    *("errors", "devices", "config", "task", "sac", "storage", "control", "learning", "evaluation", "agents", "runs"),
-    *("adapters", "export", "figures", "viewer", "cli", PACKAGE),
+    *(
+        "errors",
+        "devices",
+        "config",
+        "task",
+        "sac",
+        "learners",
+        "storage",
+        "control",
+        "learning",
+        "evaluation",
+        "agents",
+    ),
+    *("runs", "adapters", "export", "figures", "viewer", "cli", PACKAGE),
 )
 
 MAX_BOXES, MAX_MODULES, MAX_FILE, MAX_FUNCTION = 20, 13, 300, 50

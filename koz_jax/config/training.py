@@ -24,6 +24,7 @@ from koz_jax.config.base import (
     check_steps,
 )
 from koz_jax.config.curriculum import CurriculumConfig
+from koz_jax.config.learners.deterministic import DdpgConfig, Td3Config
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import TaskConfig
 
@@ -160,8 +161,14 @@ class TrainConfig(Settings):
     """What is learned."""
     network: NetworkConfig = NetworkConfig()
     """What learns it."""
+    learner: Literal["sac", "td3", "ddpg"] = "sac"
+    """Who learns: Soft Actor-Critic, or what it is compared with, which shares the settings of ``sac`` that it has."""
     sac: SacConfig = SacConfig()
     """How it learns."""
+    td3: Td3Config = Td3Config()
+    """How TD3 learns."""
+    ddpg: DdpgConfig = DdpgConfig()
+    """How DDPG learns."""
     curriculum: CurriculumConfig
     """In what order it learns."""
     refine: RefineConfig = RefineConfig()
@@ -247,9 +254,18 @@ class TrainConfig(Settings):
             self.shielding.in_force.check(self.task.spacecraft.torque_limits)
         return self
 
+    @model_validator(mode="after")
+    def _can_be_summed(self) -> Self:
+        if self.learner == "ddpg" and self.ddpg.zone_priority * self.sac.buffer_size >= 2**31:
+            raise ValueError(f"ddpg.zone_priority must be below 2^31 / sac.buffer_size; got {self.ddpg.zone_priority}")
+        return self
+
     def to_json(self) -> str:
-        """What ``config.json`` of a run holds."""
-        return self.model_dump_json(indent=2) + "\n"
+        """What ``config.json`` of a run holds; of the learners, only the one that is not Soft Actor-Critic."""
+        unused = {"td3", "ddpg"} - {self.learner}
+        if self.learner == "sac":
+            unused.add("learner")
+        return self.model_dump_json(indent=2, exclude=unused) + "\n"
 
     @property
     def sha256(self) -> str:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from koz_jax.sac.learner import LearnerMetrics
+from koz_jax.sac.actor_critic import LearnerMetrics
 from koz_jax.task.reward import RewardTerms
 
 _NEVER = 2**31 - 1

@@ -8,16 +8,14 @@ from flax import struct
 
 from koz_jax import devices
 from koz_jax.config.training import TrainConfig
-from koz_jax.control import encoding
 from koz_jax.control.shield.filter import under_shield
-from koz_jax.learning import curriculum, finite_checks
+from koz_jax.learning import curriculum, finite_checks, learners
 from koz_jax.learning.curriculum import Difficulty
-from koz_jax.sac import learner as sac_learner
 from koz_jax.sac import replay_buffer
-from koz_jax.sac.learner import LearnerMetrics, LearnerState, Sac
+from koz_jax.sac.actor_critic import LearnerMetrics, LearnerState
 from koz_jax.sac.losses import Batch
 from koz_jax.sac.replay_buffer import ReplayBuffer, Transition
-from koz_jax.task import observation_layout, reward
+from koz_jax.task import reward
 from koz_jax.task.any_spacecraft import spread, units
 from koz_jax.task.environment import Reorientation
 from koz_jax.task.observation_layout import ACTION_SIZE
@@ -51,21 +49,6 @@ class TrainMetrics(struct.PyTreeNode):
     learner: LearnerMetrics
     reward: RewardTerms  # per environment step, unweighted
     fault: jax.Array  # () int32, the first term that was not finite (see ``finite_checks``)
-
-
-def make_sac(config: TrainConfig) -> Sac:
-    """The learner's static settings."""
-    return Sac(
-        hidden_sizes=config.network.hidden_sizes,
-        encoding=encoding.views(config.network),
-        dials=encoding.dials(config.network),
-        observation_size=observation_layout.size(config.network.observed_zones, config.network.scaled),
-        action_size=ACTION_SIZE,
-        target_entropy=config.sac.target_entropy,
-        soft_update=config.sac.soft_update,
-        policy_average=config.sac.policy_average,
-        initial_entropy_coefficient=config.sac.initial_entropy_coefficient,
-    )
 
 
 def training_environment(config: TrainConfig) -> Reorientation:
@@ -181,7 +164,7 @@ def init(config: TrainConfig, key: jax.Array) -> TrainState:
     fill_keys = jax.random.split(key_fill, config.prefill_steps)
     (states, buffer), _ = jax.lax.scan(fill, (states, buffer), (jnp.arange(config.prefill_steps), fill_keys))
     return TrainState(
-        learner=sac_learner.init(make_sac(config), key_learner),
+        learner=learners.make(config).init(key_learner),
         buffer=buffer,
         env_states=states,
         key=key,
@@ -194,7 +177,8 @@ def _rewarded_batch(
 ) -> Batch:
     """Draw transitions and reward them as the curriculum stands now.  Leaves: (updates_per_step * batch, ...)."""
     count = config.updates_per_step * config.sac.batch_size
-    windows = replay_buffer.sample_windows(buffer, key, count, config.sac.n_step)
+    priority = learners.priority(config, buffer.rows.outcome, at.phase)
+    windows = replay_buffer.sample_windows(buffer, key, count, config.sac.n_step, priority)
     terms = reward.terms(windows.outcome, curriculum.reward_params(at, env.reward), env.nominal_limits)
     weights = curriculum.reward_weights(at).replace(intervention=config.shielding.intervention_cost)
     rewards = config.sac.reward_scale * reward.total(terms, weights)
@@ -203,7 +187,7 @@ def _rewarded_batch(
 
 def train_step(config: TrainConfig, env: Reorientation, state: TrainState) -> tuple[TrainState, TrainMetrics]:
     """One step of all environments, then ``updates_per_step`` gradient updates."""
-    sac = make_sac(config)
+    algorithm = learners.make(config)
     at = curriculum.difficulty(config.curriculum, state.updates)
     key, key_action, key_reset, key_batch, key_updates = jax.random.split(state.key, 5)
 
@@ -211,7 +195,7 @@ def train_step(config: TrainConfig, env: Reorientation, state: TrainState) -> tu
     step = config.prefill_steps + state.updates // config.updates_per_step
     episodes = episodes_at(config, env, step)
     observed = episodes.env.observe_each(episodes.measure(state.env_states))
-    action, _ = sac.act(state.learner.policy, observed).sample(key_action)
+    action = algorithm.explore(state.learner, observed, key_action)
     env_states, transition = _advance(config, episodes, state.env_states, observed, action, key_reset)
     buffer = replay_buffer.insert(state.buffer, transition)
 
@@ -220,13 +204,13 @@ def train_step(config: TrainConfig, env: Reorientation, state: TrainState) -> tu
 
     def learn(learner: LearnerState, inputs: tuple[Batch, jax.Array]) -> tuple[LearnerState, LearnerMetrics]:
         batch, key_update = inputs
-        return sac_learner.update(sac, learner, batch, key_update, at.learning_rate)
+        return algorithm.update(learner, batch, key_update, at.learning_rate)
 
     keys = jax.random.split(key_updates, config.updates_per_step)
     learner, learner_metrics = jax.lax.scan(learn, state.learner, (batches, keys))
     terms = reward.terms(transition.outcome, env.reward, env.nominal_limits)
-    networks = (state.learner.policy, state.learner.critic, state.learner.log_alpha)
-    fault = finite_checks.first_fault(finite_checks.Watched(networks, observed, terms, drawn.reward, learner_metrics))
+    trained = state.learner.trained
+    fault = finite_checks.first_fault(finite_checks.Watched(trained, observed, terms, drawn.reward, learner_metrics))
     state = TrainState(learner, buffer, env_states, key, state.updates + config.updates_per_step)
     learned, rewarded = jax.tree.map(jnp.mean, (learner_metrics, terms))
     return state, TrainMetrics(learned, rewarded, fault)

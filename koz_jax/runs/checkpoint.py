@@ -22,7 +22,7 @@ from koz_jax.learning.refinement import RefineState
 from koz_jax.learning.train_step import TrainState
 from koz_jax.runs.folder import RunFolder
 from koz_jax.sac import replay_buffer
-from koz_jax.sac.learner import LearnerState
+from koz_jax.sac.actor_critic import LearnerState
 from koz_jax.storage import archive, pytrees
 
 _log = logging.getLogger(__name__)
@@ -217,7 +217,7 @@ def _newest_good(
 
 
 # Settings (by the beginning of their name) that decide the shapes of a learner and a replay buffer.
-_SIZES = ("network.", "num_envs", "sac.buffer_size")
+_SIZES = ("learner", "network.", "num_envs", "sac.buffer_size")
 
 
 def _settings_of(folder: Path) -> TrainConfig:

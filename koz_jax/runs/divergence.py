@@ -8,7 +8,7 @@ import jax
 from koz_jax.config.training import TrainConfig
 from koz_jax.errors import DivergenceError
 from koz_jax.learning.finite_checks import NO_FAULT, all_finite, fault_name
-from koz_jax.sac.learner import LearnerMetrics
+from koz_jax.sac.actor_critic import LearnerMetrics
 from koz_jax.storage import processes, pytrees
 from koz_jax.task.reward import PAPER_WEIGHTS
 

@@ -19,7 +19,7 @@ from koz_jax.learning import curriculum, finite_checks, refinement, train_step
 from koz_jax.runs import checkpoint, divergence, sharding
 from koz_jax.runs.checkpoint import RunState
 from koz_jax.runs.metrics_log import flatten
-from koz_jax.sac.learner import LearnerState
+from koz_jax.sac.actor_critic import LearnerState
 from koz_jax.storage import processes
 from koz_jax.task import reward
 
@@ -128,7 +128,7 @@ class Stage(abc.ABC):
 
 
 class Learning(Stage):
-    """A phase of the curriculum, by Soft Actor-Critic."""
+    """A phase of the curriculum, by gradient updates of Soft Actor-Critic or another learner."""
 
     @property
     def rewarded_as_at(self) -> int:
@@ -231,7 +231,7 @@ def plan(config: TrainConfig) -> tuple[Stage, ...]:
         eval_every=config.eval_every,
         eval_from=0,
         agent="phase2",
-        agent_at_end="phase2-sac" if iterations else None,
+        agent_at_end=f"phase2-{config.learner}" if iterations else None,
     )
     third = Refinement(
         config,

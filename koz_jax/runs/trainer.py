@@ -28,7 +28,7 @@ from koz_jax.runs.interrupt import GracefulShutdown
 from koz_jax.runs.progress import Progress
 from koz_jax.runs.stages import Stage
 from koz_jax.runs.writer import RunWriter
-from koz_jax.sac.learner import LearnerState
+from koz_jax.sac.actor_critic import LearnerState
 from koz_jax.storage import ahead, processes
 from koz_jax.storage.lock import FolderLock
 

@@ -1,4 +1,4 @@
-"""Policy and critics of Soft Actor-Critic, and the squashed Gaussian that the policy draws from."""
+"""Policy and critics, and the squashed Gaussian that the policy of Soft Actor-Critic draws from."""
 
 from typing import Any
 
@@ -95,14 +95,15 @@ class Policy(nn.Module):
         return SquashedGaussian(mean, jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX))
 
 
-class TwinCritic(nn.Module):
-    """Two independent estimates of Q(s, a)."""
+class Critics(nn.Module):
+    """Independent estimates of Q(s, a)."""
 
     hidden_sizes: tuple[int, ...]
     encoding: Encoding
+    count: int = 2
 
     @nn.compact
     def __call__(self, observation: jax.Array, action: jax.Array) -> jax.Array:
-        """observation: (..., n), action: (..., actions).  Returns (2, ...)."""
+        """observation: (..., n), action: (..., actions).  Returns (count, ...)."""
         x = jnp.concatenate([encode(observation, self.encoding), action], axis=-1)
-        return jnp.stack([Mlp(self.hidden_sizes, 1)(x)[..., 0] for _ in range(2)])
+        return jnp.stack([Mlp(self.hidden_sizes, 1)(x)[..., 0] for _ in range(self.count)])

@@ -50,17 +50,28 @@ def truncate_newest(buffer: ReplayBuffer) -> ReplayBuffer:
     return buffer.replace(rows=buffer.rows.replace(truncated=truncated))
 
 
-def sample_windows(buffer: ReplayBuffer, key: jax.Array, count: int, length: int) -> Transition:
-    """Draw runs of consecutive steps of one environment, uniformly.
+def sample_windows(
+    buffer: ReplayBuffer, key: jax.Array, count: int, length: int, priority: jax.Array | None = None
+) -> Transition:
+    """Draw runs of consecutive steps of one environment, uniformly or in proportion to the priority of the first step.
 
-    Needs at least ``length`` rows of data.  Returns leaves (length, count, ...).
+    Needs at least ``length`` rows of data.  priority: (steps, environments) int32, at least 1, of each step where it is
+    in the ring; their sum must stay below 2^31.  Returns leaves (length, count, ...).
     """
     steps, num_envs = buffer.rows.terminated.shape
-    key_start, key_env = jax.random.split(key)
-    start = jax.random.randint(key_start, (count,), 0, buffer.size - length + 1)
-    env = jax.random.randint(key_env, (count,), 0, num_envs)
     oldest = buffer.head - buffer.size
-    step = (oldest + start + jnp.arange(length)[:, None]) % steps
+    starts = buffer.size - length + 1
+    if priority is None:
+        key_start, key_env = jax.random.split(key)
+        start = oldest + jax.random.randint(key_start, (count,), 0, starts)
+        env = jax.random.randint(key_env, (count,), 0, num_envs)
+    else:
+        may_start = (jnp.arange(steps) - oldest) % steps < starts
+        # Whole numbers: a sum of a million of them is exact.
+        ends = jnp.cumsum(jnp.where(may_start[:, None], priority, 0).ravel())
+        place = jnp.searchsorted(ends, jax.random.randint(key, (count,), 0, ends[-1]), side="right")
+        start, env = place // num_envs, place % num_envs
+    step = (start + jnp.arange(length)[:, None]) % steps
     return jax.tree.map(lambda leaf: leaf[step, env], buffer.rows)
 
 

@@ -17,10 +17,10 @@ from koz_jax.config.spread import SpreadConfig
 from koz_jax.config.task import RewardConfig, ScenarioConfig, TaskConfig
 from koz_jax.config.training import NetworkConfig, SacConfig, TrainConfig
 from koz_jax.config.uncertainty import UncertaintyConfig
-from koz_jax.learning import curriculum, train_step
+from koz_jax.learning import curriculum, learners, train_step
 from koz_jax.runs import checkpoint
-from koz_jax.sac import learner as sac_learner
 from koz_jax.sac import replay_buffer
+from koz_jax.sac.learner import Sac
 from koz_jax.task import observation
 from koz_jax.task.environment import Reorientation
 from koz_jax.task.scenario import SamplingRule
@@ -315,7 +315,7 @@ def test_prefill_acts_uniformly_and_training_acts_by_its_policy(steps, flight):
     observe, _ = flight
     for step in steps:
         observed = observe(step.before.env_states)
-        expected = _act(train_step.make_sac(CONFIG), step.before.learner.policy, observed, step_keys(step)[1])
+        expected = _act(learners.make_sac(CONFIG), step.before.learner.policy, observed, step_keys(step)[1])
         np.testing.assert_allclose(step.row.action, expected, atol=1e-5)
     actions = np.concatenate([step.row.action for step in steps])
     assert len(np.unique(actions[:, 0])) == len(actions)
@@ -392,7 +392,7 @@ def test_reward_is_that_of_the_present_curriculum(steps, change):
 
 @functools.partial(jax.jit, static_argnums=0)
 def _learn(sac, learner, batch, key, rate):
-    return sac_learner.update(sac, learner, batch, key, rate)
+    return sac.update(learner, batch, key, rate)
 
 
 @pytest.mark.parametrize("index", [5, STEPS - 2])
@@ -404,7 +404,7 @@ def test_a_step_learns_from_the_buffer_with_the_new_row_in_it(steps, index):
     learner = step.before.learner
     for i, key in enumerate(jax.random.split(key_updates, 2)):
         part = jax.tree.map(lambda leaf, i=i: leaf[16 * i : 16 * (i + 1)], batch)
-        learner, _ = _learn(train_step.make_sac(CONFIG), learner, part, key, at.learning_rate)
+        learner, _ = _learn(learners.make_sac(CONFIG), learner, part, key, at.learning_rate)
     moved = jax.tree.map(
         lambda new, old: np.max(np.abs(new - old)), step.after.learner.policy, step.before.learner.policy
     )
@@ -482,12 +482,12 @@ def _without_learning(sac, learner, *arguments):
     return learner, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), metrics)
 
 
-_UPDATE = sac_learner.update
+_UPDATE = Sac.update
 
 
 def test_every_episode_has_a_spacecraft_of_its_own(monkeypatch):
     """Environments are drawn anew exactly where their episode ends, and each differently."""
-    monkeypatch.setattr(train_step.sac_learner, "update", _without_learning)
+    monkeypatch.setattr(Sac, "update", _without_learning)
     spread = CONFIG.task.model_copy(update={"spread": SpreadConfig(spacecraft=True, urgency=(0.0, 1.0))})
     network = CONFIG.network.model_copy(update={"scaled": True})
     config = CONFIG.model_copy(update={"task": spread, "network": network, "training_episode_seconds": 2.0})

@@ -21,7 +21,7 @@ from koz_jax.runs import divergence
 from koz_jax.runs.folder import RunFolder
 from koz_jax.runs.trainer import train
 from koz_jax.sac import losses
-from koz_jax.sac.learner import LearnerMetrics
+from koz_jax.sac.actor_critic import LearnerMetrics
 from koz_jax.task.reward import PAPER_WEIGHTS
 
 NAN = float("nan")

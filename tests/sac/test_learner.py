@@ -11,10 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from support.reference import COUNT, adam, as_float64, assert_close, encoded, make_batch, mlp, norm, slopes, values
 
-from koz_jax.sac import learner as sac_learner
-from koz_jax.sac.learner import LearnerState, Sac
-from koz_jax.sac.losses import Batch
+from koz_jax.sac.learner import Sac, SacState
 
 SAC = Sac(
     hidden_sizes=(6, 5),
@@ -26,24 +25,10 @@ SAC = Sac(
     policy_average=0.1,
     initial_entropy_coefficient=0.5,
 )
-COUNT = 12
 RATE = 0.02  # large: the order of the steps must show
-BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8
 
-_init = jax.jit(sac_learner.init, static_argnums=0)
-_update = jax.jit(sac_learner.update, static_argnums=0)
-
-
-def make_batch(seed):
-    draw = np.random.default_rng(seed)
-    array = functools.partial(jnp.asarray, dtype=jnp.float32)
-    return Batch(
-        observation=array(draw.normal(size=(COUNT, 3))),
-        action=array(draw.uniform(-1, 1, (COUNT, 2))),
-        reward=array(draw.normal(size=COUNT)),
-        discount=array(np.where(draw.random(COUNT) < 0.3, 0.0, 0.9)),
-        next_observation=array(draw.normal(size=(COUNT, 3))),
-    )
+_init = jax.jit(Sac.init, static_argnums=0)
+_update = jax.jit(Sac.update, static_argnums=0)
 
 
 def in_midst_of_training(seed):
@@ -73,17 +58,6 @@ def in_midst_of_training(seed):
     )
 
 
-def encoded(observation):
-    return np.concatenate([observation, np.tanh(observation[:, 0:2] / 0.3)], axis=1)
-
-
-def mlp(net, x):
-    for i in range(3):
-        x = x @ net[f"Dense_{i}"]["kernel"] + net[f"Dense_{i}"]["bias"]
-        x = np.maximum(x, 0.0) if i < 2 else x
-    return x
-
-
 def act(policy, observation, noise):
     """Squashed action and log probability for given noise."""
     output = mlp(policy["params"]["Mlp_0"], encoded(observation))
@@ -92,51 +66,6 @@ def act(policy, observation, noise):
     log_density = -0.5 * noise**2 - log_std - 0.5 * np.log(2 * np.pi)
     log_slope = 2.0 * (np.log(2.0) - np.logaddexp(raw, -raw))
     return np.tanh(raw), np.sum(log_density - log_slope, axis=1)
-
-
-def values(critic, observation, action):
-    x = np.concatenate([encoded(observation), action], axis=1)
-    return np.stack([mlp(critic["params"][name], x)[:, 0] for name in ("Mlp_0", "Mlp_1")])
-
-
-def slopes(loss, tree, h=1e-6):
-    """Gradient of ``loss(tree)`` by central differences."""
-    leaves, structure = jax.tree.flatten(tree)
-    gradients = []
-    for leaf in leaves:
-        gradient = np.zeros_like(leaf)
-        for at in np.ndindex(leaf.shape):
-            old = leaf[at]
-            leaf[at] = old + h
-            above = loss(jax.tree.unflatten(structure, leaves))
-            leaf[at] = old - h
-            below = loss(jax.tree.unflatten(structure, leaves))
-            leaf[at] = old
-            gradient[at] = (above - below) / (2 * h)
-        gradients.append(gradient)
-    return jax.tree.unflatten(structure, gradients)
-
-
-def adam(params, gradient, optimizer, rate):
-    """Kingma and Ba's Adam with bias correction.  Returns the new parameters and optimizer state."""
-    count = int(optimizer.count) + 1
-    mu = jax.tree.map(lambda m, g: BETA_1 * m + (1 - BETA_1) * g, optimizer.mu, gradient)
-    nu = jax.tree.map(lambda v, g: BETA_2 * v + (1 - BETA_2) * g**2, optimizer.nu, gradient)
-    stepped = jax.tree.map(
-        lambda p, m, v: p - rate * (m / (1 - BETA_1**count)) / (np.sqrt(v / (1 - BETA_2**count)) + EPSILON),
-        params,
-        mu,
-        nu,
-    )
-    return stepped, optax.ScaleByAdamState(np.array(count), mu, nu)
-
-
-def norm(tree):
-    return np.sqrt(sum(np.sum(leaf**2) for leaf in jax.tree.leaves(tree)))
-
-
-def as_float64(tree):
-    return jax.tree.map(lambda x: np.array(x, np.float64), tree)
 
 
 def reference_update(learner, batch, key, rate):
@@ -171,7 +100,7 @@ def reference_update(learner, batch, key, rate):
     def average(share, new, before):
         return jax.tree.map(lambda n, b: share * n + (1 - share) * b, new, before)
 
-    new = LearnerState(
+    new = SacState(
         policy=policy,
         averaged_policy=average(SAC.policy_average, policy, old.averaged_policy),
         critic=critic,
@@ -199,13 +128,7 @@ def both_updates(seed):
 
 
 SEEDS = (0, 1, 2)
-PARTS = list(LearnerState.__dataclass_fields__)
-
-
-def assert_close(found, expected, **tolerance):
-    assert jax.tree.structure(found) == jax.tree.structure(expected)
-    for (path, leaf), wanted in zip(jax.tree.leaves_with_path(found), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(leaf, wanted, **tolerance, err_msg=jax.tree_util.keystr(path))
+PARTS = list(SacState.__dataclass_fields__)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from koz_jax.sac.networks import DIAL_FEATURES, Policy, SquashedGaussian, TwinCritic, dial_features, encode
+from koz_jax.sac.networks import DIAL_FEATURES, Critics, Policy, SquashedGaussian, dial_features, encode
 
 
 def log_prob_float64(mean, log_std, noise):
@@ -105,7 +105,7 @@ def policy():
 
 @pytest.fixture(scope="module")
 def critic():
-    network = TwinCritic(hidden_sizes=(64, 48), encoding=((0, 2, 0.1),))
+    network = Critics(hidden_sizes=(64, 48), encoding=((0, 2, 0.1),))
     return network, jax.jit(network.init)(jax.random.key(1), jnp.zeros(4), jnp.zeros(3))
 
 

@@ -94,6 +94,24 @@ def test_windows_are_drawn_uniformly(inserted):
     assert chi_square < freedom + 4.0 * np.sqrt(2.0 * freedom)
 
 
+@pytest.mark.parametrize("inserted", [6, 12])
+def test_windows_are_drawn_in_proportion_to_the_priority_of_their_first_step(inserted):
+    count, length = COUNT, 3
+    buffer = filled(8, inserted)
+    stamps = np.asarray(buffer.rows.action[..., 0], int)
+    priority = jnp.asarray(np.where(stamps % 4 == 1, 5, 1), jnp.int32)
+    window = _sample(buffer, jax.random.key(1), count, length, priority)
+    stamp = np.asarray(window.action[..., 0], int)
+    np.testing.assert_array_equal(np.diff(stamp, axis=0), 10)
+    jax.tree.map(np.testing.assert_array_equal, window, stamped(stamp))
+    values, found = np.unique(stamp[0], return_counts=True)
+    assert len(values) == (min(inserted, 8) - length + 1) * NUM_ENVS
+    share = np.where(values % 4 == 1, 5, 1)
+    expected = count * share / share.sum()
+    chi_square, freedom = np.sum((found - expected) ** 2 / expected), len(values) - 1
+    assert chi_square < freedom + 4.0 * np.sqrt(2.0 * freedom)
+
+
 def test_draws_differ_between_keys_and_within_a_batch():
     buffer = filled(8, 8)
     one, again, other = (np.asarray(_sample(buffer, jax.random.key(k), COUNT, 1).action) for k in (1, 1, 2))

@@ -4,13 +4,14 @@ All have the same shapes, so that all share one compilation.
 """
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from koz_jax.sac import learner as sac_learner
 from koz_jax.sac import replay_buffer
-from koz_jax.sac.learner import LearnerMetrics, LearnerState, Sac
+from koz_jax.sac.actor_critic import Learner, LearnerMetrics, LearnerState
+from koz_jax.sac.learner import Sac, SacState
 from koz_jax.sac.losses import Batch
 from koz_jax.sac.replay_buffer import Transition
 
@@ -33,25 +34,30 @@ GREEDY = 1e-8  # an entropy coefficient that does not matter, and stays so over 
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _learn(sac: Sac, batches: Batch, key: jax.Array, log_alpha: jax.Array) -> tuple[LearnerState, LearnerMetrics]:
+def _learn(algorithm: Learner, batches: Batch, key: jax.Array, **begin: jax.Array) -> tuple[Any, LearnerMetrics]:
     key_init, key_updates = jax.random.split(key)
     rates = jnp.linspace(5e-3, 0.0, UPDATES)
 
     def body(learner, inputs):
         batch, key_update, rate = inputs
-        return sac_learner.update(sac, learner, batch, key_update, rate)
+        return algorithm.update(learner, batch, key_update, rate)
 
-    learner = sac_learner.init(sac, key_init).replace(log_alpha=log_alpha)
+    learner = algorithm.init(key_init).replace(**begin)
     return jax.lax.scan(body, learner, (batches, jax.random.split(key_updates, UPDATES), rates))
 
 
-def learn(batches: Batch, alpha: float = GREEDY) -> tuple[LearnerState, LearnerMetrics]:
+def learn(batches: Batch, alpha: float = GREEDY) -> tuple[SacState, LearnerMetrics]:
     """The learner after all batches, and the metrics of every update."""
-    return _learn(SAC, batches, jax.random.key(0), jnp.log(jnp.float32(alpha)))
+    return _learn(SAC, batches, jax.random.key(0), log_alpha=jnp.log(jnp.float32(alpha)))
+
+
+def learn_with(algorithm: Learner, batches: Batch) -> Any:
+    """The state of a learner after all batches."""
+    return _learn(algorithm, batches, jax.random.key(0))[0]
 
 
 @jax.jit
-def value(learner: LearnerState, observation: jax.Array, action: jax.Array) -> jax.Array:
+def value(learner: SacState, observation: jax.Array, action: jax.Array) -> jax.Array:
     """Both critics.  observation: (n, 2), action: (n, 1).  Returns (2, n)."""
     return SAC.value(learner.critic, observation, action)
 

@@ -1,0 +1,1 @@
+"""Settings of the learners beside Soft Actor-Critic."""

@@ -1,0 +1,1 @@
+"""Learners beside Soft Actor-Critic, on its networks and replay buffer; none knows of spacecraft."""
