@@ -9,7 +9,8 @@ from pydantic import Field, model_validator
 from koz_jax.config.base import Fraction, PositiveFloat, Settings, ZoneCount
 from koz_jax.config.uncertainty import CERTAIN, DelaySteps, UncertaintyConfig
 
-Urgency = Annotated[float, Field(ge=0, le=1)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Urgency = Share
 InstrumentCount = Annotated[int, Field(ge=1, le=3)]
 
 
@@ -31,7 +32,7 @@ class SpreadConfig(Settings):
     instruments: InstrumentCount = 1
     """Instruments of these spacecraft, each somewhere; the zone in the way is for the first, each further one for one
     of them."""
-    keep_in: Annotated[float, Field(ge=0, le=1)] = 0.0
+    keep_in: Share = 0.0
     """Share of the other instruments' zones that are cones to keep them in, of half angles from 60 to 100 deg."""
     step_shares: tuple[PositiveFloat, PositiveFloat] = (0.009, 0.05)
     """Time steps of these spacecraft, in units of T = sqrt(J / u)."""
@@ -44,6 +45,9 @@ class SpreadConfig(Settings):
     """Errors that every maneuver is flown with."""
     delay_steps: tuple[DelaySteps, DelaySteps] | None = None
     """Steps by which the torque comes late, distributed evenly; None leaves those of ``errors``."""
+    nominal: Share = 0.0
+    """Share of the maneuvers that are flown without errors and delay, with the least number of zones and the largest
+    limit of the body rate."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

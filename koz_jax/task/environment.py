@@ -92,8 +92,9 @@ class Reorientation(struct.PyTreeNode):
             return self
         found = spread.draw(self.spread, self.model, self.ranges, key)
         uncertainty = self.uncertainty
-        if uncertainty is not None and found.delay is not None:
-            uncertainty = uncertainty.replace(delay=found.delay)
+        if uncertainty is not None:
+            delay = uncertainty.delay if found.delay is None else found.delay
+            uncertainty = uncertainty.without_errors(found.nominal).replace(delay=delay)
         return self.replace(
             model=found.model, ranges=found.ranges, urgency=found.urgency, uncertainty=uncertainty, spread=None
         )

@@ -64,10 +64,10 @@ class ScenarioRanges(struct.PyTreeNode):
     max_half_angle: jax.Array  # () [rad]
     separation: jax.Array  # () [rad] between a zone's edge and the boresight at start and target
     zone_gap: jax.Array  # () [rad] least gap between the edges of two zones
-    min_zones: jax.Array  # () int32, least number of zones
+    zone_counts: jax.Array  # (2,) int32, least and largest number of zones
     keep_in: jax.Array  # () share of the other instruments' zones that are cones to keep them in
     others_B: jax.Array | None  # (n, 3) unit vectors of other instruments; None where there are none
-    max_zones: int = struct.field(pytree_node=False)  # largest number of zones, and length of their stack
+    max_zones: int = struct.field(pytree_node=False)  # length of the stack of zones
 
 
 class Scenario(struct.PyTreeNode):
@@ -191,7 +191,8 @@ def _add_zones(key: jax.Array, ranges: ScenarioRanges, q_e: jax.Array, first: Po
     q_e: (4,) attitude at the start, relative to the target; first: leaves (1, ...).  Returns leaves (max_zones, ...).
     """
     keys = jax.random.split(key, ranges.max_zones)
-    number = jax.random.randint(keys[0], (), ranges.min_zones, ranges.max_zones + 1)
+    fewest, most = ranges.zone_counts
+    number = jax.random.randint(keys[0], (), fewest, most + 1)
     to_all = jax.vmap(rotations.angle_between, in_axes=(None, 0))
 
     def add(i: jax.Array, zones: PointingConstraint) -> PointingConstraint:
@@ -248,7 +249,7 @@ def from_config(task: TaskConfig, min_angle_deg: float, max_angle_deg: float) ->
         max_half_angle=jnp.deg2rad(jnp.float32(config.max_half_angle_deg)),
         separation=jnp.deg2rad(jnp.float32(config.separation_deg)),
         zone_gap=jnp.deg2rad(jnp.float32(config.zone_gap_deg)),
-        min_zones=jnp.int32(min_zones),
+        zone_counts=jnp.array([min_zones, max_zones], jnp.int32),
         keep_in=jnp.zeros(()),
         others_B=None,
         max_zones=max_zones,

@@ -20,6 +20,10 @@ class Uncertainty(struct.PyTreeNode):
     rate_bias: jax.Array  # () [rad/s] norm of a constant error of the measured rate
     delay: jax.Array | None = None  # () int32, steps by which the torque comes late; None: never
 
+    def without_errors(self, nominal: jax.Array) -> "Uncertainty":
+        """The same, or none of it in a nominal maneuver.  nominal: () bool."""
+        return jax.tree.map(lambda bound: jnp.where(nominal, jnp.zeros_like(bound), bound), self)
+
 
 # Noise is a normal distribution cut at so many standard deviations, so that a bound exists.
 NOISE_BOUND = 3.0

@@ -25,6 +25,9 @@ PURPOSE = 0x535052
 # Separates the key of the delay from those of the other draws.
 _DELAY = 0x44454C
 
+# Separates the key of whether a maneuver is nominal from those of the other draws.
+_NOMINAL = 0x4E4F4D
+
 # Separates the key of the other instruments from those of the other draws.
 _OTHERS = 0x4F5448
 
@@ -55,6 +58,7 @@ class Spread(struct.PyTreeNode):
     slenderness: jax.Array  # (2,) smallest over largest second moment
     wheel_momentum: jax.Array  # (2,) [u T]
     keep_in: jax.Array  # () share of the other instruments' zones that are cones to keep them in
+    nominal: jax.Array  # () share of the maneuvers without errors, with fewest zones and the largest rate limit
     instruments: int = struct.field(pytree_node=False)
     spacecraft: bool = struct.field(pytree_node=False)
     rate_limits: bool = struct.field(pytree_node=False)
@@ -70,23 +74,29 @@ class Drawn(struct.PyTreeNode):
     ranges: ScenarioRanges  # for its instruments
     urgency: jax.Array  # ()
     delay: jax.Array | None  # () int32; None where it is not spread
+    nominal: jax.Array  # () bool, to be flown without errors
 
 
 def draw(spread: Spread, model: Model, ranges: ScenarioRanges, key: jax.Array) -> Drawn:
     """Draw for one maneuver; what is not spread is as given.  key: () typed PRNG key."""
     key_body, key_boresight, key_rate, key_urgency = jax.random.split(key, 4)
+    nominal = jax.random.bernoulli(jax.random.fold_in(key, _NOMINAL), spread.nominal)
+    fewest, most = ranges.zone_counts
+    ranges = ranges.replace(zone_counts=jnp.stack([fewest, jnp.where(nominal, fewest, most)]))
     delay = None
     if spread.late:
         shortest, longest = spread.delays
         delay = jax.random.randint(jax.random.fold_in(key, _DELAY), (), shortest, longest + 1)
+        delay = jnp.where(nominal, 0, delay)
     if spread.spacecraft:
         model = _sample_body(spread, model, key_body)
         boresight_B = rotations.normalize(jax.random.normal(key_boresight, (3,)))
         ranges = ranges.replace(boresight_B=boresight_B, others_B=_others(spread, key), keep_in=spread.keep_in)
     if spread.rate_limits:
         low, high = jnp.log(spread.max_rates)
-        model = model.replace(max_rate=jnp.exp(jax.random.uniform(key_rate, (), minval=low, maxval=high)))
-    return Drawn(model, ranges, _urgency(spread, key_urgency), delay)
+        limit = jax.random.uniform(key_rate, (), minval=low, maxval=high)
+        model = model.replace(max_rate=jnp.exp(jnp.where(nominal, high, limit)))
+    return Drawn(model, ranges, _urgency(spread, key_urgency), delay, nominal)
 
 
 def _others(spread: Spread, key: jax.Array) -> jax.Array | None:
@@ -174,6 +184,7 @@ def from_config(task: TaskConfig) -> Spread | None:
         slender=config.slenderness is not None,
         wheel_momentum=jnp.array(config.wheel_momentum),
         keep_in=jnp.float32(config.keep_in),
+        nominal=jnp.float32(config.nominal),
         instruments=config.instruments,
         wheels=config.wheels,
     )

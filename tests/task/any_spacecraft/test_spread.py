@@ -8,6 +8,7 @@ import pytest
 from koz_jax.config.base import checked
 from koz_jax.config.spread import SpreadConfig
 from koz_jax.config.task import TaskConfig
+from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.errors import SettingsError
 from koz_jax.task.any_spacecraft import spread, units
 from koz_jax.task.environment import Reorientation, model_from_config
@@ -128,3 +129,21 @@ def test_wheels_have_the_strength_of_the_spacecraft_and_a_bias(wheels, count):
 def test_wheels_without_spacecraft_are_refused():
     with pytest.raises(SettingsError, match="wheels: are drawn with spacecraft = true"):
         checked(SpreadConfig, wheels="three")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_nominal_maneuvers_have_no_errors_fewest_zones_and_the_largest_rate_limit(share):
+    errors = UncertaintyConfig(inertia_error=0.1, rate_noise_deg=0.001, delay_steps=1)
+    drawing = SpreadConfig(
+        spacecraft=True, zones=(1, 4), max_rate_deg=(2.0, 20.0), errors=errors, delay_steps=(1, 2), nominal=share
+    )
+    env = Reorientation.from_config(TaskConfig(spread=drawing))
+    envs = jax.jit(jax.vmap(env.drawn))(jax.random.split(jax.random.key(2), COUNT))
+    nominal = np.asarray(envs.uncertainty.inertia_error) == 0.0
+    assert abs(np.mean(nominal) - share) <= 4.0 * np.sqrt(share * (1.0 - share) / COUNT)
+    fewest, most = np.asarray(envs.ranges.zone_counts).T
+    assert np.all(fewest == 1) and np.all(most == np.where(nominal, 1, 4))
+    assert np.all((np.asarray(envs.uncertainty.delay) == 0) == nominal)
+    assert np.all((np.asarray(envs.uncertainty.rate_noise) == 0.0) == nominal)
+    fastest = np.isclose(np.asarray(envs.model.max_rate), np.deg2rad(20.0), rtol=1e-5)
+    assert np.all(fastest[nominal]) and np.sum(fastest[~nominal]) < 0.01 * COUNT
