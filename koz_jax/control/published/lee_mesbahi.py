@@ -13,7 +13,7 @@ Gains are those with which Yang et al. (10.2514/1.G005026) fly the first form: a
 numbers alpha is, we could not read.  It is taken for the damping [N m s], and the gradient has the factor 1/2 with
 which V + w' I w / 2 never rises, as dV/dt = w . vec(q* (x) grad V) / 2.  Torques are cut by component, which the
 proofs do not cover.  The torque limit of the published flight is lost too: its 268.5 N^2 m^2 s are 183 here with 2 N m
-and steps of 0.1 s, 261 with no limit and steps of 0.01 s.
+and steps of 0.1 s; with no limit and steps of 0.003 s they are 256, and 1117 without the factor 1/2.
 """
 
 import jax
