@@ -19,6 +19,7 @@ import stamp
 
 from koz_jax.agents.agent import load_agent
 from koz_jax.cli.exit_status import exit_status
+from koz_jax.config.filters import FilterConfig
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import TaskConfig
@@ -50,11 +51,11 @@ FIGURES = (
 )
 
 
-def decision_us(controller: Controller, task: TaskConfig, shield: ShieldConfig | None) -> float:
+def decision_us(controller: Controller, task: TaskConfig, shield: FilterConfig | None) -> float:
     """Microseconds per decision, shield included: a maneuver's time, less that of one in which nothing is decided."""
     drawn = scenario.paper_test()
 
-    def seconds(flown: Controller, shield: ShieldConfig | None) -> float:
+    def seconds(flown: Controller, shield: FilterConfig | None) -> float:
         env = cases.environment(task, MonteCarloConfig(shield=shield))
         run = jax.jit(lambda env, who: rollout.run_case(env, who, drawn).reward)
         jax.block_until_ready(run(env, flown))

@@ -4,9 +4,9 @@ from pathlib import Path
 
 from koz_jax.agents.agent import Agent, load_agent
 from koz_jax.agents.record import DEFAULT_AGENT, DEFAULT_FOR_OTHERS
+from koz_jax.config.filters import FilterConfig
 from koz_jax.config.maneuvers.maneuver import ManeuverConfig
 from koz_jax.config.monte_carlo import MonteCarloConfig
-from koz_jax.config.shield import ShieldConfig
 from koz_jax.control.base import TaskController
 from koz_jax.control.registry import BUILT_IN, load_controller
 from koz_jax.errors import SettingsError
@@ -19,7 +19,7 @@ def fly(
     agent: TaskController | Path | str | None = None,
     *,
     urgency: float | None = None,
-    shield: ShieldConfig | None = None,
+    shield: FilterConfig | None = None,
     seed: int = 0,
     substeps: int = maneuvers.SUBSTEPS,
 ) -> FlownManeuver:
@@ -30,7 +30,7 @@ def fly(
         agent: who flies: an agent or controller, the name of a built-in controller, ``FILE.py:CLASS``, or what
             ``load_agent`` takes; by default a shipped agent: the one of the paper's spacecraft, or the one for all.
         urgency: how much an agent hurries that listens to it, from 0 (thrifty) to 1 (as fast as the torque allows).
-        shield: to fly under; None flies without.
+        shield: or another safety filter to fly under; None flies without.
         seed: of what is random in flight: errors, and planners' searches.
         substeps: constraints are checked at so many instants of every step, at least 5.
 

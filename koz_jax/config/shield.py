@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Self
+from typing import ClassVar, Self
 
 from pydantic import AliasChoices, Field, model_validator
 
@@ -13,6 +13,8 @@ from koz_jax.errors import SettingsError
 
 class ShieldConfig(Settings):
     """The shield."""
+
+    name: ClassVar[str] = "shield"
 
     margin_deg: MarginDeg = 0.1
     """Angle kept from every zone [deg]; more is kept where attitude noise is withstood."""

@@ -15,12 +15,12 @@ from flax import struct
 from jax.sharding import Mesh, PartitionSpec
 
 from koz_jax import devices
+from koz_jax.config.filters import FilterConfig
 from koz_jax.config.monte_carlo import MonteCarloConfig
-from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import TaskConfig, check_feasible
 from koz_jax.control.base import Controller, TaskController
+from koz_jax.control.filters.from_settings import under_filter
 from koz_jax.control.registry import as_task_controller
-from koz_jax.control.shield.filter import under_shield
 from koz_jax.errors import SettingsError
 from koz_jax.evaluation import cautions, rollout
 from koz_jax.evaluation.rollout import CaseResult, History
@@ -59,7 +59,7 @@ class _Flight(struct.PyTreeNode):
     controller: Controller
     key: jax.Array  # () typed PRNG key of the draw
     substeps: int = struct.field(pytree_node=False)
-    shield: ShieldConfig | None = struct.field(pytree_node=False)
+    shield: FilterConfig | None = struct.field(pytree_node=False)
 
     def case(self, index: jax.Array | int) -> Scenario:
         """Draw one case.  index: () int."""
@@ -90,18 +90,18 @@ def environment(task: TaskConfig, config: MonteCarloConfig) -> Reorientation:
         env = env.replace(uncertainty=uncertainty.from_config(config.uncertainty))
     if config.shield is not None:
         config.shield.check(task.spacecraft.torque_limits)
-    return under_shield(env, config.shield)
+    return under_filter(env, config.shield)
 
 
 def _key(config: MonteCarloConfig) -> jax.Array:
     return jax.random.fold_in(jax.random.key(config.seed), _PURPOSE)
 
 
-def _of_case(env: Reorientation, key: jax.Array, index: jax.Array | int, shield: ShieldConfig | None) -> Reorientation:
+def _of_case(env: Reorientation, key: jax.Array, index: jax.Array | int, shield: FilterConfig | None) -> Reorientation:
     """An environment with all that is drawn for a case, and the shield of the spacecraft that is drawn."""
     if env.spread is None:
         return env
-    return under_shield(env.drawn(jax.random.fold_in(jax.random.fold_in(key, spread.PURPOSE), index)), shield)
+    return under_filter(env.drawn(jax.random.fold_in(jax.random.fold_in(key, spread.PURPOSE), index)), shield)
 
 
 def _flight_key(key: jax.Array, index: jax.Array | int) -> jax.Array:

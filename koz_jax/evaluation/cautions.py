@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from koz_jax.config import plausibility
+from koz_jax.config.filters import FilterConfig
 from koz_jax.config.monte_carlo import MonteCarloConfig
-from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import TaskConfig
 from koz_jax.control.base import TaskController
 from koz_jax.control.policy import PolicyController
@@ -79,10 +79,10 @@ def _told(numbers: npt.ArrayLike) -> str:
     return ", ".join(f"{number:g}" for number in np.atleast_1d(numbers))
 
 
-def warn_of_target(agent: TaskController, drawn: Scenario, shield: ShieldConfig | None) -> None:
+def warn_of_target(agent: TaskController, drawn: Scenario, shield: FilterConfig | None) -> None:
     """Warn of a target from which a zone is nearer than the agent was trained for, or than the shield allows.
 
-    drawn: one maneuver; shield: that is flown under, if any.
+    drawn: one maneuver; shield: or another filter that is flown under, if any.
     """
     present = np.asarray(drawn.constraints.is_present)
     if not present.any():
@@ -92,7 +92,7 @@ def warn_of_target(agent: TaskController, drawn: Scenario, shield: ShieldConfig 
     least = agent.task.scenario.separation_deg if isinstance(agent.controller, PolicyController) else 0.0
     where = f"the target is {margin:.3g} deg from the edge of a zone" if margin > 0.0 else "the target is inside a zone"
     if shield is not None and margin < shield.margin_deg:
-        _log.warning("%s, and the shield keeps %g deg: it is never reached", where, shield.margin_deg)
+        _log.warning("%s, and the %s keeps %g deg: it is never reached", where, shield.name, shield.margin_deg)
     elif margin < least - _ROUNDING_DEG:
         _log.warning("%s; %s was trained with %g deg or more, and may never settle on it", where, agent.name, least)
     elif margin <= 0.0:

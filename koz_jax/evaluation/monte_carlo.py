@@ -54,7 +54,7 @@ class MonteCarlo:
     @property
     def label(self) -> str:
         """Who flew, for tables and titles."""
-        return self.agent if self.config.shield is None else f"{self.agent} + shield"
+        return self.agent if self.config.shield is None else f"{self.agent} + {self.config.shield.name}"
 
     @property
     def is_of_paper(self) -> bool:

@@ -29,6 +29,7 @@ class CaseResult(struct.PyTreeNode):
     mean_torque_change: jax.Array  # () [N m] mean norm of that change over all steps
     deadlocked: jax.Array  # () bool, not settled and the shield changed the torque in the last step
     unsafe_start: jax.Array  # () bool, in a zone at the start, or in a state from which the shield promises nothing
+    infeasible_steps: jax.Array  # () int32 steps in which the filter found no torque that keeps what it guarantees
     peak_rate: jax.Array  # () [rad/s] largest norm of the body rate
     torque_variation: jax.Array  # () [N m] sum over steps and axes of how much the torque changes
     unrest: jax.Array  # () mean squared action over the last fifth of the maneuver
@@ -72,6 +73,7 @@ class _Tally(struct.PyTreeNode):
     interventions: jax.Array  # () steps in which the shield changed the torque
     torque_change: jax.Array  # () [N m] sum of the norms of that change
     intervened: jax.Array  # () bool, in the last step
+    infeasible_steps: jax.Array
     peak_rate: jax.Array
     torque_variation: jax.Array
     unrest: jax.Array
@@ -125,6 +127,7 @@ def _first_tally(env: Reorientation, start: _Flight) -> _Tally:
         interventions=jnp.int32(0),
         torque_change=jnp.zeros(()),
         intervened=jnp.array(False),
+        infeasible_steps=jnp.int32(0),
         peak_rate=rotations.norm(start.state.body.omega_BN_B),
         torque_variation=jnp.zeros(()),
         unrest=jnp.zeros(()),
@@ -201,6 +204,7 @@ def _judge(env: Reorientation, start: EnvState, end: _Tally) -> CaseResult:
         mean_torque_change=end.torque_change / env.episode_steps,
         deadlocked=~settled & end.intervened,
         unsafe_start=~(env.covers(start) & (env.margin(start) > 0.0)),
+        infeasible_steps=end.infeasible_steps,
         peak_rate=end.peak_rate,
         torque_variation=end.torque_variation,
         unrest=end.unrest,
@@ -210,12 +214,14 @@ def _judge(env: Reorientation, start: EnvState, end: _Tally) -> CaseResult:
 def _interventions(env: Reorientation, tally: _Tally, stepped: Step) -> dict[str, jax.Array]:
     """How often and how much the filter changed torques, after one more step."""
     if env.action_filter is None:
-        return {name: getattr(tally, name) for name in ("interventions", "torque_change", "intervened")}
+        names = ("interventions", "torque_change", "intervened", "infeasible_steps")
+        return {name: getattr(tally, name) for name in names}
     changed = stepped.command.intervened
     return {
         "interventions": tally.interventions + changed,
         "torque_change": tally.torque_change + jnp.linalg.norm(env.nominal_limits.box_B * stepped.command.change),
         "intervened": changed,
+        "infeasible_steps": tally.infeasible_steps + ~stepped.command.feasible,
     }
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from koz_jax.config.filters import ZohCbfConfig
 from koz_jax.evaluation.digits import percent, percent_between, significant
 
 if TYPE_CHECKING:
@@ -40,6 +41,8 @@ class Summary:
     mean_torque_change: float = 0.0
     deadlock_rate: float = 0.0
     unsafe_start_rate: float = 0.0
+    infeasible_steps_mean: float = 0.0
+    infeasible_case_rate: float = 0.0
 
 
 class Evaluated(Protocol):
@@ -110,6 +113,8 @@ def summarise(results: CaseResult) -> Summary:
         mean_torque_change=float(np.mean(results.mean_torque_change)),
         deadlock_rate=float(np.mean(results.deadlocked)),
         unsafe_start_rate=float(np.mean(results.unsafe_start)),
+        infeasible_steps_mean=float(np.mean(results.infeasible_steps)),
+        infeasible_case_rate=float(np.mean(np.asarray(results.infeasible_steps) > 0)),
     )
 
 
@@ -135,20 +140,26 @@ def table(
     """
     if isinstance(flown, Summary):
         did_something = bool(flown.intervention_rate or flown.deadlock_rate or flown.unsafe_start_rate)
-        return _lines(flown, cases, name, did_something if shielded is None else shielded, paper)
-    with_shield = flown.config.shield is not None
-    return _lines(summarise(flown.results), flown.config.cases, name or flown.label, with_shield, flown.is_of_paper)
+        with_shield = did_something if shielded is None else shielded
+        return _lines(flown, cases, name, "shield" if with_shield else None, paper)
+    under = None if flown.config.shield is None else flown.config.shield.name
+    return _lines(summarise(flown.results), flown.config.cases, name or flown.label, under, flown.is_of_paper)
 
 
-def _lines(ours: Summary, cases: int, name: str, shielded: bool, paper: bool) -> str:
-    """Rows of a label, the paper's number and ours, aligned."""
+def _lines(ours: Summary, cases: int, name: str, under: str | None, paper: bool) -> str:
+    """Rows of a label, the paper's number and ours, aligned.  under: name of the filter that flew, if any."""
     rows = [(f"{cases} cases", "paper", name), *_rows(ours, cases)]
-    if shielded:
+    if under is not None:
         rows += [
-            ("shield intervened, of all steps", "-", percent(ours.intervention_rate)),
+            (f"{under} intervened, of all steps", "-", percent(ours.intervention_rate)),
             ("mean change of torque [N m]", "-", significant(ours.mean_torque_change, 4)),
             ("deadlocked", "-", percent(ours.deadlock_rate)),
-            ("start not covered by the shield", "-", percent(ours.unsafe_start_rate)),
+            (f"start not covered by the {under}", "-", percent(ours.unsafe_start_rate)),
+        ]
+    if under == ZohCbfConfig.name or ours.infeasible_case_rate:
+        rows += [
+            ("steps without a solution, per case", "-", significant(ours.infeasible_steps_mean, 3)),
+            ("cases with such a step", "-", percent(ours.infeasible_case_rate)),
         ]
     columns = (0, 1, 2) if paper else (0, 2)
     widths = [max(len(row[column]) for row in rows) for column in columns]

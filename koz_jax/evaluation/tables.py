@@ -39,6 +39,7 @@ def cases_csv(results: CaseResult) -> str:
             "mean_torque_change_Nm": np.asarray(results.mean_torque_change),
             "deadlocked": np.asarray(results.deadlocked),
             "unsafe_start": np.asarray(results.unsafe_start),
+            "infeasible_steps": np.asarray(results.infeasible_steps),
             "settled": np.asarray(results.settled),
             "violated": np.asarray(results.violated),
         }

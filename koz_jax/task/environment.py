@@ -150,9 +150,10 @@ class Reorientation(struct.PyTreeNode):
         """
         requested = jnp.clip(action, -1.0, 1.0)
         if self.action_filter is None:
-            return Command(requested, requested)
+            return Command(requested, requested, jnp.array(True))
         held, asked = jax.lax.stop_gradient((measured, requested))
-        return Command(requested, _straight_through(requested, self.action_filter.allow(held, asked, self.model)))
+        allowed = self.action_filter.allow(held, asked, self.model)
+        return Command(requested, _straight_through(requested, allowed.action), allowed.feasible)
 
     def step(
         self,

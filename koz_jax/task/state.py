@@ -47,6 +47,13 @@ class EnvState(struct.PyTreeNode):
     on_the_way: jax.Array | None = None  # (MAX_DELAY, 3) last commands, the latest first; None where none is late
 
 
+class Allowed(struct.PyTreeNode):
+    """What a filter lets through."""
+
+    action: jax.Array  # (3,) in [-1, 1]
+    feasible: jax.Array  # () bool, whether there was any action that keeps what the filter guarantees
+
+
 class ActionFilter(Protocol):
     """What stands between a controller and the actuators, such as the shield.  Implementations are pytrees."""
 
@@ -54,8 +61,8 @@ class ActionFilter(Protocol):
         """Whether what the filter guarantees holds from this state on.  Returns () bool."""
         ...
 
-    def allow(self, measured: EnvState, action: jax.Array, model: Model) -> jax.Array:
-        """Action (3,) in [-1, 1] that is let through in place of the requested one (3,) in [-1, 1]."""
+    def allow(self, measured: EnvState, action: jax.Array, model: Model) -> Allowed:
+        """What is let through in place of the requested action (3,) in [-1, 1]."""
         ...
 
 
@@ -64,6 +71,7 @@ class Command(struct.PyTreeNode):
 
     requested: jax.Array  # (3,) by the controller, clipped to [-1, 1]
     applied: jax.Array  # (3,) after the filter
+    feasible: jax.Array  # () bool, false where the filter found no action that keeps what it guarantees
 
     @property
     def intervened(self) -> jax.Array:

@@ -25,6 +25,7 @@ JSON_KEYS = [
     *("control_effort_mean", "control_effort_std", "control_accuracy_deg_mean", "control_accuracy_deg_std"),
     *("non_settled_rate", "violation_rate", "success_rate"),
     *("min_margin_deg", "intervention_rate", "mean_torque_change", "deadlock_rate", "unsafe_start_rate"),
+    *("infeasible_steps_mean", "infeasible_case_rate"),
     *("settling_time_scaled_mean", "control_effort_scaled_mean", "compile_s", "wall_s"),
 ]
 
@@ -77,6 +78,8 @@ BAD = [
     ("--colour red", ["--colour"]),
     ("--robust", ["robust: is of the shield, and needs --shield"]),
     ("--shield-margin-deg 1", ["shield_margin_deg: needs --shield, got 1.0"]),
+    ("--shield --filter zoh_cbf", ["filter: give either --shield or --filter, got --filter zoh_cbf and --shield"]),
+    ("--filter zoh_cbf --robust", ["robust: is of the shield, and needs --shield"]),
     ("--shield --robust", ["robust: needs an error to withstand"]),
     ("--shield --shield-margin-deg 0", ["shield_margin_deg: Input should be greater than 0"]),
     ("--shield --robust --disturbance-torque 3", ["disturbance_torque: must be below the torque limit of 2.0", "3.0"]),

@@ -5,6 +5,7 @@ import json
 import pytest
 from pydantic import ValidationError
 
+from koz_jax.config.filters import ZohCbfConfig
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.uncertainty import CERTAIN, UncertaintyConfig
 from koz_jax.errors import SettingsError, explain
@@ -46,3 +47,14 @@ def test_a_delay_is_not_withstood_and_refused_by_name():
     with pytest.raises(ValidationError) as caught:
         ShieldConfig(error_bounds=UncertaintyConfig(delay_steps=1))
     assert "delay_steps: the shield does not withstand a delay; allowed is 0, got 1" in explain(caught.value)
+
+
+def test_the_other_filter_refuses_what_it_has_no_torque_for():
+    with pytest.raises(
+        SettingsError, match=r"disturbance_torque: must be below the torque limit of 1\.0 N m.*got 1\.0"
+    ):
+        ZohCbfConfig(disturbance_torque=1.0).check((2.0, 1.0, 2.0))
+    with pytest.raises(SettingsError, match=r"zoh_cbf\.cone_rate_deg: must be at least 0\.5, .* got 0\.1"):
+        ZohCbfConfig(cone_rate_deg=0.1).check_cones(0.5)
+    with pytest.raises(ValueError, match="samples: must be at least 100, got 99"):
+        ZohCbfConfig(samples=99)

@@ -51,6 +51,8 @@ REPORT_KEYS = [
     "mean_torque_change",
     "deadlock_rate",
     "unsafe_start_rate",
+    "infeasible_steps_mean",
+    "infeasible_case_rate",
     "settling_time_scaled_mean",
     "control_effort_scaled_mean",
     "compile_s",

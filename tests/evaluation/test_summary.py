@@ -235,3 +235,18 @@ def test_the_papers_column_can_be_left_out(ours):
     text = table(ours, 10_000, "mine", paper=False)
     assert "paper" not in text and "7281.91" not in text
     assert _cells(text)["mean reward"] == ["7495.12 +- 412.35"]
+
+
+def test_steps_without_a_solution_have_rows_where_there_are_some(ours):
+    rows = _cells(
+        table(dataclasses.replace(ours, infeasible_steps_mean=0.25, infeasible_case_rate=0.01), 10_000, "mine")
+    )
+    assert rows["steps without a solution, per case"] == ["-", "0.250"]
+    assert rows["cases with such a step"] == ["-", "1.00 %"]
+    assert "cases with such a step" not in _cells(table(ours, 10_000, "mine"))
+
+
+def test_steps_without_a_solution_are_counted(mixed):
+    steps = np.array([0, 3, *[0] * 197, 5], np.int32)
+    found = summarise(mixed.replace(infeasible_steps=steps))
+    assert (found.infeasible_steps_mean, found.infeasible_case_rate) == (8 / 200, 2 / 200)

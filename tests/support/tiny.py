@@ -216,4 +216,5 @@ def unshielded(cases: int) -> dict[str, Any]:
         "mean_torque_change": np.zeros(cases, np.float32),
         "deadlocked": np.zeros(cases, bool),
         "unsafe_start": np.zeros(cases, bool),
+        "infeasible_steps": np.zeros(cases, np.int32),
     }

@@ -15,7 +15,7 @@ from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.environment import Reorientation
 from koz_jax.task.pointing_constraints import PointingConstraint
 from koz_jax.task.scenario import SamplingRule, Scenario
-from koz_jax.task.state import EnvState, Model, Step, Truth
+from koz_jax.task.state import Allowed, EnvState, Model, Step, Truth
 
 STEPS = 200
 SAMPLES = 3
@@ -291,8 +291,9 @@ class Halving(struct.PyTreeNode):
     def covers(self, at: EnvState, model: Model) -> jax.Array:
         return at.steps == 0
 
-    def allow(self, measured: EnvState, action: jax.Array, model: Model) -> jax.Array:
-        return jax.lax.while_loop(lambda x: jnp.any(jnp.abs(x) > 0.5), lambda x: 0.5 * x, action)
+    def allow(self, measured: EnvState, action: jax.Array, model: Model) -> Allowed:
+        halved = jax.lax.while_loop(lambda x: jnp.any(jnp.abs(x) > 0.5), lambda x: 0.5 * x, action)
+        return Allowed(halved, jnp.array(True))
 
 
 @pytest.fixture(scope="module")
@@ -354,8 +355,8 @@ def test_the_filter_knows_what_is_measured_and_not_what_is(start, env):
         def start(self, drawn: Scenario, model: Model) -> Scenario:
             return drawn
 
-        def allow(self, measured: EnvState, action: jax.Array, model: Model) -> jax.Array:
-            return measured.body.omega_BN_B
+        def allow(self, measured: EnvState, action: jax.Array, model: Model) -> Allowed:
+            return Allowed(measured.body.omega_BN_B, jnp.array(True))
 
     shown = start.replace(body=start.body.replace(omega_BN_B=jnp.array([0.1, 0.2, 0.3])))
     turning = env.replace(action_filter=Turn())

@@ -13,6 +13,7 @@ from koz_jax.agents.record import DEFAULT_AGENT, shipped_agents
 from koz_jax.cli.flags import parsing
 from koz_jax.cli.flags.parsing import ChangesOf, agents_own, same_as
 from koz_jax.config.base import MarginDeg, NonNegativeFloat, Settings, ZoneCount
+from koz_jax.config.filters import FilterConfig, FilterName, ZohCbfConfig
 from koz_jax.config.monte_carlo import CaseConfig, MonteCarloConfig
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.spread import Urgency
@@ -79,6 +80,9 @@ class _RuleFlags(Settings):
     angle_convention: Literal["full", "half"] | None = agents_own(TaskConfig, "angle_convention")
     shield: bool = False
     """Fly under the shield, which keeps the boresight out of every zone whatever the controller asks for."""
+    filter: FilterName | None = None
+    """Fly under a safety filter by its name: shield, the same as --shield, or zoh_cbf, the control-barrier-function
+    filter of Breeden & Panagou."""
     shield_margin_deg: MarginDeg = same_as(ShieldConfig, "margin_deg")
     robust: bool = False
     """Make the shield withstand the errors that are flown with, which the flags of errors set."""
@@ -89,7 +93,9 @@ class FlightFlags(UncertaintyConfig, _RuleFlags, CaseConfig):
 
     @model_validator(mode="after")
     def _of_the_shield(self) -> Self:
-        if not self.shield:
+        if self.shield and self.filter is not None:
+            raise ValueError(f"filter: give either --shield or --filter, got --filter {self.filter} and --shield")
+        if self._filter_name != "shield":
             if self.robust:
                 raise ValueError("robust: is of the shield, and needs --shield")
             if self.shield_margin_deg != ShieldConfig().margin_deg:
@@ -104,10 +110,17 @@ class FlightFlags(UncertaintyConfig, _RuleFlags, CaseConfig):
         return UncertaintyConfig(**self.model_dump(include={*UncertaintyConfig.model_fields}))
 
     @property
-    def shield_config(self) -> ShieldConfig | None:
-        """The shield to fly under, if one is asked for."""
-        if not self.shield:
+    def _filter_name(self) -> FilterName | None:
+        """What to fly under, by either flag."""
+        return "shield" if self.shield else self.filter
+
+    @property
+    def filter_config(self) -> FilterConfig | None:
+        """The shield or other filter to fly under, if one is asked for."""
+        if self._filter_name is None:
             return None
+        if self._filter_name == "zoh_cbf":
+            return ZohCbfConfig()
         return ShieldConfig(
             margin_deg=self.shield_margin_deg, error_bounds=self.uncertainty if self.robust else CERTAIN
         )
@@ -116,7 +129,7 @@ class FlightFlags(UncertaintyConfig, _RuleFlags, CaseConfig):
         """Which cases are flown, and how."""
         return MonteCarloConfig(
             **self.model_dump(include={*CaseConfig.model_fields}),
-            shield=self.shield_config,
+            shield=self.filter_config,
             uncertainty=None if self.uncertainty == CERTAIN else self.uncertainty,
         )
 
@@ -138,10 +151,10 @@ class FlightFlags(UncertaintyConfig, _RuleFlags, CaseConfig):
         """
         changed = parsing.applied("task", task, self.task_changes)
         task = changed.with_rules(self.angle_convention, self.infeasible_zone, self.zones, self.max_rate_deg)
-        if self.shield_config is not None:
-            self.shield_config.check(task.spacecraft.torque_limits)
+        if self.filter_config is not None:
+            self.filter_config.check(task.spacecraft.torque_limits)
         return task
 
     def label(self, agent: TaskController) -> str:
         """Who flies, for tables and titles."""
-        return f"{agent.name} + shield" if self.shield else agent.name
+        return agent.name if self._filter_name is None else f"{agent.name} + {self._filter_name}"

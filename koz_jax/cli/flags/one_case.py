@@ -93,8 +93,8 @@ class OneCaseFlags(FlightFlags):
         if self.own_maneuver is None:
             return super().task(agent)
         task = self.own_maneuver.task.with_rules(self.angle_convention)
-        if self.shield_config is not None:
-            self.shield_config.check(task.spacecraft.torque_limits)
+        if self.filter_config is not None:
+            self.filter_config.check(task.spacecraft.torque_limits)
         return task
 
     @property

@@ -22,7 +22,7 @@ from koz_jax.task.actuators import TorqueLimits
 from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.environment import Reorientation
 from koz_jax.task.pointing_constraints import PointingConstraint
-from koz_jax.task.state import EnvState, Model, nominal_limits, torque_limits
+from koz_jax.task.state import Allowed, EnvState, Model, nominal_limits, torque_limits
 from koz_jax.task.uncertainty import NOISE_BOUND
 
 # Shares of the request in a mix with the guide, and of the guide in a mix with the brake, that are tried in this order.
@@ -48,25 +48,26 @@ class Shield(struct.PyTreeNode):
     guide: Guide
     rate_limit: RateLimit | None = None  # None where the spacecraft has none
 
-    def covers(self, state: EnvState, model: Model) -> jax.Array:
+    def covers(self, at: EnvState, model: Model) -> jax.Array:
         """Whether the guarantee holds from this state on: braking keeps the margin.  Returns () bool.
 
         Braking itself is possible for actuators that store momentum only below their largest rate.
         """
-        safe = is_safe(self, state.body, state.scenario.constraints, model)
-        if model.actuators.stored_momentum(state.actuators) is None:
+        safe = is_safe(self, at.body, at.scenario.constraints, model)
+        if model.actuators.stored_momentum(at.actuators) is None:
             return safe
-        limit = self._limit_now(state, model)
-        return safe & (True if limit is None else limit.squared_peak(state.body) <= limit.squared)
+        limit = self._limit_now(at, model)
+        return safe & (True if limit is None else limit.squared_peak(at.body) <= limit.squared)
 
-    def allow(self, measured: EnvState, action: jax.Array, model: Model) -> jax.Array:
-        """Action (3,) in [-1, 1] that is let through in place of the requested one (3,) in [-1, 1]."""
+    def allow(self, measured: EnvState, action: jax.Array, model: Model) -> Allowed:
+        """What is let through in place of the requested action (3,) in [-1, 1]; the brake at the worst."""
         limits = torque_limits(measured, model)
         torque_B = limits.box_B * action
         now = self.replace(rate_limit=self._limit_now(measured, model))
         allowed_B = now.filter(measured.body, torque_B, measured.scenario.constraints, limits, model)
         # What passes comes back to the last bit, also where the limit is no power of two.
-        return jnp.where(jnp.all(allowed_B == torque_B), action, allowed_B / limits.box_B)
+        passed = jnp.where(jnp.all(allowed_B == torque_B), action, allowed_B / limits.box_B)
+        return Allowed(passed, jnp.array(True))
 
     def _limit_now(self, measured: EnvState, model: Model) -> RateLimit | None:
         if self.rate_limit is None or model.actuators.stored_momentum(measured.actuators) is None:

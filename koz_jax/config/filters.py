@@ -1,0 +1,68 @@
+"""Settings of safety filters: what can stand between a controller and the actuators.  Imports no jax."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal, Self
+
+from pydantic import model_validator
+
+from koz_jax.config.base import NonNegativeFloat, PositiveFloat, PositiveInt, Seed, Settings, Vector
+from koz_jax.config.shield import ShieldConfig
+from koz_jax.errors import SettingsError
+
+FilterName = Literal["shield", "zoh_cbf"]
+
+
+class ZohCbfConfig(Settings):
+    """The control-barrier-function filter for held torques of Breeden & Panagou 2023, as of Yang & Ben-Larbi 2026."""
+
+    name: ClassVar[str] = "zoh_cbf"
+    margin_deg: ClassVar[float] = 0.0
+
+    max_rate: PositiveFloat = 0.956
+    """Largest rate that it lets a spacecraft reach [1/T], T = sqrt(J / u); 10 deg/s for the paper's."""
+    disturbance_torque: NonNegativeFloat = 0.0
+    """Norm of the torque from outside that it allows for [N m]."""
+    cone_rate_deg: NonNegativeFloat = 0.0
+    """Largest rate of a cone's axis that it allows for [deg/s]; a maneuver file says its own."""
+    samples: PositiveInt = 2000
+    """States in which its bounds are looked for."""
+    seed: Seed = 0
+    """Seed of these states."""
+
+    @model_validator(mode="after")
+    def _enough(self) -> Self:
+        if self.samples < 100:
+            raise ValueError(f"samples: must be at least 100, got {self.samples}")
+        return self
+
+    def check(self, torque_limits: Vector) -> None:
+        """Refuse a disturbance that a spacecraft has no torque for.  torque_limits: [N m] about each body axis.
+
+        Raises:
+            SettingsError: the disturbance is as strong.
+
+        """
+        weakest = min(torque_limits)
+        if self.disturbance_torque >= weakest:
+            raise SettingsError(
+                f"disturbance_torque: must be below the torque limit of {weakest} N m for the filter to allow for it,"
+                f" got {self.disturbance_torque}"
+            )
+
+    def check_cones(self, rate_deg: float) -> None:
+        """Refuse a maneuver whose cones turn faster than is allowed for.  rate_deg: [deg/s] of the fastest axis.
+
+        Raises:
+            SettingsError: they do.
+
+        """
+        # With room for what float32 rounds.
+        if rate_deg > self.cone_rate_deg * (1.0 + 1e-5):
+            raise SettingsError(
+                f"zoh_cbf.cone_rate_deg: must be at least {rate_deg:.6g}, the rate of the maneuver's fastest cone, got"
+                f" {self.cone_rate_deg:g}"
+            )
+
+
+FilterConfig = ShieldConfig | ZohCbfConfig
