@@ -10,26 +10,20 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import stamp
 
 from koz_jax.agents.agent import load_agent
 from koz_jax.cli.exit_status import exit_status
-from koz_jax.config.filters import FilterConfig
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import TaskConfig
-from koz_jax.control.base import Controller, Memoryless, TaskController
+from koz_jax.control.base import TaskController
 from koz_jax.control.registry import ADVERSARIAL, CLASSICAL, load_controller
-from koz_jax.evaluation import cases, rollout
+from koz_jax.evaluation import cases, timing
 from koz_jax.evaluation.summary import summarise
 from koz_jax.storage import runtime
-from koz_jax.task import scenario
-from koz_jax.task.state import EnvState, Model
 
 SUBSTEPS = 5
 
@@ -51,37 +45,11 @@ FIGURES = (
 )
 
 
-def decision_us(controller: Controller, task: TaskConfig, shield: FilterConfig | None) -> float:
-    """Microseconds per decision, shield included: a maneuver's time, less that of one in which nothing is decided."""
-    drawn = scenario.paper_test()
-
-    def seconds(flown: Controller, shield: FilterConfig | None) -> float:
-        env = cases.environment(task, MonteCarloConfig(shield=shield))
-        run = jax.jit(lambda env, who: rollout.run_case(env, who, drawn).reward)
-        jax.block_until_ready(run(env, flown))
-        times = []
-        for _ in range(5):
-            start = time.perf_counter()
-            jax.block_until_ready(run(env, flown))
-            times.append(time.perf_counter() - start)
-        return min(times)
-
-    return 1e6 * (seconds(controller, shield) - seconds(_Idle(), None)) / task.episode_steps
-
-
-class _Idle(Memoryless):
-    """Decides nothing."""
-
-    def decide(self, state: EnvState, model: Model, memory: None) -> tuple[jax.Array, None]:
-        """No torque."""
-        return jnp.zeros(3), memory
-
-
 def fly(flown: TaskController, task: TaskConfig, count: int, shield: ShieldConfig | None) -> list[str]:
     """Fly a controller over the cases, and time it.  Returns its row."""
     config = MonteCarloConfig(cases=count, substeps=SUBSTEPS, shield=shield)
     summary = summarise(cases.fly_cases(flown.controller, task, config))
-    decision = decision_us(flown.controller, task, shield)
+    decision = timing.decision_us(flown.controller, task, shield)
     return [
         flown.name,
         FILTERS[shield is not None],

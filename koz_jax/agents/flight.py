@@ -7,6 +7,7 @@ from koz_jax.agents.record import DEFAULT_AGENT, DEFAULT_FOR_OTHERS
 from koz_jax.config.filters import FilterConfig
 from koz_jax.config.maneuvers.maneuver import ManeuverConfig
 from koz_jax.config.monte_carlo import MonteCarloConfig
+from koz_jax.config.task import TaskConfig
 from koz_jax.control.base import TaskController
 from koz_jax.control.registry import BUILT_IN, load_controller
 from koz_jax.errors import SettingsError
@@ -57,7 +58,7 @@ def load_for(
         SettingsError: as of ``fly``.
 
     """
-    flying = _named(maneuver, agent) if isinstance(agent, Path | str) else agent
+    flying = named(agent, maneuver.task) if isinstance(agent, Path | str) else agent
     if flying is None:
         flying = load_agent(DEFAULT_AGENT)
         if urgency is not None or maneuvers.unfamiliar(flying, maneuver):
@@ -65,9 +66,17 @@ def load_for(
     return flying if urgency is None else in_a_hurry(flying, urgency)
 
 
-def _named(maneuver: ManeuverConfig, name: Path | str) -> TaskController:
+def named(name: Path | str, task: TaskConfig) -> TaskController:
+    """An agent as ``load_agent`` takes it, or a controller by its name or file.
+
+    task: what a controller flies unless told otherwise.
+
+    Raises:
+        SettingsError: there is no such agent or controller.
+
+    """
     if isinstance(name, str) and (name in BUILT_IN or ".py:" in name):
-        return load_controller(name, maneuver.task)
+        return load_controller(name, task)
     return load_agent(name)
 
 

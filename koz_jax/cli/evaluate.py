@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import model_validator
 
 from koz_jax.agents.record import DEFAULT_FOR_OTHERS
-from koz_jax.cli import invocation
+from koz_jax.cli import invocation, suite
 from koz_jax.cli.exit_status import exit_status
 from koz_jax.cli.flags import parsing
 from koz_jax.cli.flags.flight import AgentFlags, FlightFlags
@@ -29,7 +29,10 @@ _ANY_SPACECRAFT = TaskConfig(spread=SpreadConfig(spacecraft=True))
 
 
 class EvaluateFlags(ProcessFlags, FlightFlags, AgentFlags):
-    """Fly a trained agent, or another controller, over many random cases; print the paper's table beside its own."""
+    """Fly a trained agent, or another controller, over many random cases; print the paper's table beside its own.
+
+    With --suite [FOLDER], fly everybody over published maneuvers instead: see --suite --help.
+    """
 
     spacecraft: str | None = None
     """Fly another spacecraft than the agent's in the paper's draw, times in its own units: a TOML file with a table
@@ -71,6 +74,8 @@ class EvaluateFlags(ProcessFlags, FlightFlags, AgentFlags):
 
 def main(argv: Sequence[str]) -> int:
     """Evaluate and print.  Returns the exit status."""
+    if suite.FLAG in argv:
+        return suite.main([argument for argument in argv if argument != suite.FLAG])
     return exit_status(lambda: _evaluate(parsing.parse(EvaluateFlags, argv, invocation.command("evaluate"))))
 
 

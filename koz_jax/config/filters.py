@@ -66,3 +66,8 @@ class ZohCbfConfig(Settings):
 
 
 FilterConfig = ShieldConfig | ZohCbfConfig
+
+
+def filter_named(name: FilterName) -> FilterConfig:
+    """A filter by its name, with its default settings."""
+    return ZohCbfConfig() if name == "zoh_cbf" else ShieldConfig()

@@ -66,8 +66,7 @@ def test_fly_refuses_before_it_flies(name, agent, tmp_path, capsys, monkeypatch)
 
 # --- maneuvers of one's own ---
 
-EXAMPLES = tiny.ROOT / "examples"
-PAPER, CUBESAT = EXAMPLES / "paper.toml", EXAMPLES / "cubesat_6u.toml"
+PAPER, CUBESAT = (tiny.MANEUVER_FILES[name] for name in ("paper", "cubesat_6u"))
 HALF = (0.7071, 0.0, 0.7071, 0.0)  # a quarter turn about y
 
 

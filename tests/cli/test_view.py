@@ -99,7 +99,7 @@ def test_controllers_shields_and_zones_are_shown(saved, tmp_path, capsys):
 
 def test_a_maneuver_of_ones_own_is_shown_as_it_is_flown(saved, tmp_path):
     """By who is named; where nobody is, by who was made for the spacecraft."""
-    text = (tiny.ROOT / "examples" / "calaon1.toml").read_text()
+    text = tiny.MANEUVER_FILES["calaon1"].read_text()
     (tmp_path / "mine.toml").write_text(
         text.replace("step_seconds = 0.2", "step_seconds = 0.2\nduration_seconds = 2.0")
     )

@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.tiny import ROOT, merged
+from support.tiny import MANEUVER_FILES, merged
 
 from koz_jax.config import attitudes
 from koz_jax.config.maneuvers.maneuver import ManeuverConfig
@@ -18,7 +18,7 @@ from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.errors import SettingsError
 from koz_jax.task import rotations
 
-EXAMPLES = sorted((ROOT / "examples").glob("*.toml"))
+EXAMPLES = list(MANEUVER_FILES.values())
 
 # A start that looks along z, a target 120 deg away, a cone beside the way.
 TEXT = """

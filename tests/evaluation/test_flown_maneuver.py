@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from support.tiny import ROOT, merged, untrained_agent
+from support.tiny import MANEUVER_FILES, merged, untrained_agent
 
 import koz_jax
 from koz_jax.agents.flight import load_for
@@ -25,12 +25,12 @@ from koz_jax.task import scenario
 from koz_jax.task.environment import Reorientation
 from koz_jax.task.state import propagate
 
-EXAMPLES = {path.stem: load_maneuver(path) for path in sorted((ROOT / "examples").glob("*.toml"))}
+EXAMPLES = {name: load_maneuver(path) for name, path in MANEUVER_FILES.items()}
 PAPER = EXAMPLES["paper"]
 
 
 def changed(name: str, **changes: Any) -> ManeuverConfig:
-    given = tomllib.loads((ROOT / "examples" / f"{name}.toml").read_text())
+    given = tomllib.loads(MANEUVER_FILES[name].read_text())
     return ManeuverConfig.model_validate(merged({"errors": {}} | given, changes))
 
 

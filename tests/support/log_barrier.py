@@ -1,7 +1,6 @@
 """The published potential and the rates of Lyapunov functions made of it, in float64 and by differences."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +14,9 @@ from koz_jax.task.pointing_constraints import smallest_margin
 from koz_jax.task.scenario import Scenario
 from koz_jax.task.state import EnvState, Model
 from support.states import actions, directions, quaternions, random_states
+from support.tiny import MANEUVER_FILES
 
-PUBLISHED = load_maneuver(Path(__file__).parents[2] / "examples" / "yang2021.toml")
+PUBLISHED = load_maneuver(MANEUVER_FILES["yang2021"])
 YANG = model_from_config(PUBLISHED.task)
 
 COUNT = 64

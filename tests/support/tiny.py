@@ -29,6 +29,13 @@ from koz_jax.task import observation_layout
 
 ROOT = Path(__file__).resolve().parents[2]
 
+# All maneuver files, by their names: those of the suite, and the examples.
+MANEUVER_FILES = {
+    path.stem: path
+    for folder in (ROOT / "koz_jax" / "evaluation" / "suite", ROOT / "examples")
+    for path in sorted(folder.glob("*.toml"))
+}
+
 # Two phases of 64 updates, each with an evaluation every second row of the log; then 8 iterations of refinement.
 SETTINGS: dict[str, Any] = {
     "task": {"episode_seconds": 2.0},
