@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,19 +10,22 @@ from typing import TYPE_CHECKING, Any
 from pydantic import model_validator
 
 from koz_jax.agents.record import DEFAULT_FOR_OTHERS
-from koz_jax.cli import invocation, suite
+from koz_jax.cli import invocation
 from koz_jax.cli.exit_status import exit_status
 from koz_jax.cli.flags import parsing
 from koz_jax.cli.flags.flight import AgentFlags, FlightFlags
 from koz_jax.cli.flags.process import ProcessFlags
+from koz_jax.cli.flags.suite import SUITE, SuiteFlags
 from koz_jax.config.maneuvers.maneuver_file import load_spacecraft
 from koz_jax.config.spread import SpreadConfig
 from koz_jax.config.task import TaskConfig
 from koz_jax.errors import SettingsError
 
 if TYPE_CHECKING:
+    from koz_jax.agents.suite import SuiteFlight
     from koz_jax.control.base import TaskController
     from koz_jax.evaluation.monte_carlo import MonteCarlo
+    from koz_jax.evaluation.rollout import History
 
 
 # Another spacecraft in every case.
@@ -74,8 +78,9 @@ class EvaluateFlags(ProcessFlags, FlightFlags, AgentFlags):
 
 def main(argv: Sequence[str]) -> int:
     """Evaluate and print.  Returns the exit status."""
-    if suite.FLAG in argv:
-        return suite.main([argument for argument in argv if argument != suite.FLAG])
+    if SUITE in argv:
+        others = [argument for argument in argv if argument != SUITE]
+        return exit_status(lambda: _suite(parsing.parse(SuiteFlags, others, invocation.command(f"evaluate {SUITE}"))))
     return exit_status(lambda: _evaluate(parsing.parse(EvaluateFlags, argv, invocation.command("evaluate"))))
 
 
@@ -184,3 +189,48 @@ def _report(flown: MonteCarlo, task: TaskConfig, label: str, asked: EvaluateFlag
         title = f"{wording.short_name(label)}: {asked.cases} random cases, seed {asked.seed}"
         for path in drawn.write(asked.figures, flown.results, task, title):
             print(f"figure: {path}")
+
+
+def _suite(asked: SuiteFlags) -> int:
+    from koz_jax.agents import suite
+    from koz_jax.storage import files, runtime
+
+    if asked.figures is not None:
+        from koz_jax.figures import style  # noqa: F401  without matplotlib, say so before the flight
+
+        files.make_folder("figures", asked.figures)
+    for name, path in (("json", asked.json_file), ("markdown", asked.markdown)):
+        if path is not None:
+            files.check_writable(name, path)
+    runtime.configure()
+    maneuvers = suite.load_suite(asked.folder)
+    lines = [_row(suite.COLUMNS), _row(["---"] * len(suite.COLUMNS))]
+    print("\n".join(lines), flush=True)
+    flights: list[SuiteFlight] = []
+    for flight in suite.fly_suite(maneuvers, asked.controllers, asked.under, asked.draw):
+        flights.append(flight)
+        lines.append(_row(flight.row.cells()))
+        print(lines[-1], flush=True)
+    if asked.json_file is not None:
+        files.write_json(asked.json_file, {"rows": [dataclasses.asdict(flight.row) for flight in flights]})
+    if asked.markdown is not None:
+        files.write_text(asked.markdown, "\n".join(lines) + "\n")
+    if asked.figures is not None:
+        _draw_suite(asked.figures, flights, asked.controllers)
+    return 0
+
+
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _draw_suite(folder: Path, flights: Sequence[SuiteFlight], names: Sequence[str]) -> None:
+    from koz_jax.figures import style
+    from koz_jax.figures import suite as drawn
+
+    histories: dict[str, dict[str, History]] = {}
+    for row, flown in flights:
+        if flown is not None and row.by in names:  # without a filter
+            histories.setdefault(row.case, {})[row.by] = flown.history
+    for path in style.save(drawn.draw(histories, "Boresight traces, without a filter"), folder, "suite"):
+        print(f"figure: {path}")
