@@ -20,7 +20,7 @@ from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import TaskConfig
 from koz_jax.control.base import TaskController
-from koz_jax.control.registry import ADVERSARIAL, CLASSICAL, load_controller
+from koz_jax.control.registry import ADVERSARIAL, CLASSICAL, LEARNED, load_controller
 from koz_jax.evaluation import cases, timing
 from koz_jax.evaluation.summary import summarise
 from koz_jax.storage import runtime
@@ -74,14 +74,14 @@ def main(argv: list[str]) -> int:
 def _compare(args: argparse.Namespace) -> int:
     runtime.configure()
     agents = ["zones3"] if args.zones > 1 else ["phase2", "phase2-sac", "zones3"]
-    everybody = [*agents, *CLASSICAL, *ADVERSARIAL]
-    names = args.only or [*agents, *CLASSICAL, *(ADVERSARIAL if args.adversarial else ())]
+    everybody = [*agents, *CLASSICAL, *LEARNED, *ADVERSARIAL]
+    names = args.only or [*agents, *CLASSICAL, *LEARNED, *(ADVERSARIAL if args.adversarial else ())]
     order = [(name, under) for name in dict.fromkeys([*everybody, *names]) for under in FILTERS]
     columns = ("controller", "under", "cases", *(name for name, _ in FIGURES), "decision [us]")
     program = "benchmarks/rivals.py" + (f" --zones {args.zones}" if args.zones > 1 else "")
     table = stamp.GrowingTable(args.markdown, program, columns, order)
     for name in names:
-        untrained = name in (*CLASSICAL, *ADVERSARIAL)
+        untrained = name in (*CLASSICAL, *LEARNED, *ADVERSARIAL)
         flown = load_controller(name) if untrained else load_agent(name)
         task = flown.task.with_rules(zones=args.zones)
         for shield in (None, ShieldConfig()):

@@ -20,6 +20,7 @@ class BuiltIn(NamedTuple):
     module: str  # in koz_jax.control
     class_name: str
     adversarial: bool = False  # does its worst, to try the shield
+    learned: bool = False  # has weights of a training in place of gains
 
 
 BUILT_IN = {
@@ -30,13 +31,15 @@ BUILT_IN = {
     "lee_mesbahi_backstepping": BuiltIn("published.lee_mesbahi", "LeeMesbahiBackstepping"),
     "yang_sliding": BuiltIn("published.yang_sliding", "YangSliding"),
     "planner": BuiltIn("planning.path_planner", "PathPlanner"),
+    "dqn": BuiltIn("slews.dqn_slews", "DqnSlews", learned=True),
     "random": BuiltIn("adversarial", "Random", adversarial=True),
     "bang_bang": BuiltIn("adversarial", "BangBang", adversarial=True),
     "adversary": BuiltIn("adversarial", "Adversary", adversarial=True),
     "spin_up": BuiltIn("adversarial", "SpinUp", adversarial=True),
 }
 
-CLASSICAL = tuple(name for name, entry in BUILT_IN.items() if not entry.adversarial)
+CLASSICAL = tuple(name for name, entry in BUILT_IN.items() if not (entry.adversarial or entry.learned))
+LEARNED = tuple(name for name, entry in BUILT_IN.items() if entry.learned)
 ADVERSARIAL = tuple(name for name, entry in BUILT_IN.items() if entry.adversarial)
 
 

@@ -6,7 +6,7 @@ from koz_jax.config.task import TaskConfig
 from koz_jax.control import registry
 from koz_jax.errors import SettingsError
 
-NAMES = (*registry.CLASSICAL, *registry.ADVERSARIAL)
+NAMES = tuple(registry.BUILT_IN)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -19,7 +19,7 @@ from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.spread import Urgency
 from koz_jax.config.task import ScenarioConfig, TaskConfig
 from koz_jax.config.uncertainty import CERTAIN, UncertaintyConfig
-from koz_jax.control.registry import ADVERSARIAL, CLASSICAL
+from koz_jax.control.registry import ADVERSARIAL, CLASSICAL, LEARNED
 
 if TYPE_CHECKING:
     from koz_jax.control.base import TaskController
@@ -34,8 +34,8 @@ URGENCY = (
     " 0.5."
 )
 CONTROLLERS = (
-    f"{', '.join(CLASSICAL)}; one that does its worst: {', '.join(ADVERSARIAL)}; or path/to/file.py:CLASS, a class of"
-    " your own"
+    f"{', '.join((*CLASSICAL, *LEARNED))}; one that does its worst: {', '.join(ADVERSARIAL)}; or"
+    " path/to/file.py:CLASS, a class of your own"
 )
 
 

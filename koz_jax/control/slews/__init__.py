@@ -1,0 +1,1 @@
+"""Planning by a choice among a few slews."""
