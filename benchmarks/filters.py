@@ -13,7 +13,6 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import rivals
 import stamp
 
 from koz_jax.agents.agent import load_agent
@@ -25,10 +24,11 @@ from koz_jax.config.task import TaskConfig
 from koz_jax.control.adversarial import AnyAdversary
 from koz_jax.control.base import Controller
 from koz_jax.control.registry import ADVERSARIAL, load_controller
-from koz_jax.evaluation import cases
+from koz_jax.evaluation import cases, timing
 from koz_jax.evaluation.summary import summarise
 from koz_jax.storage import runtime
 
+SUBSTEPS = 5
 CONTROLLERS = ("pd", "phase2", "universal", *ADVERSARIAL)
 FILTERS: tuple[FilterConfig | None, ...] = (None, ShieldConfig(), ZohCbfConfig())
 COLUMNS = ("controller", "under", "cases", "violated", "smallest margin [deg]", "success", "settling time [s]")
@@ -50,7 +50,7 @@ def under(config: FilterConfig | None) -> str:
 def fly(name: str, config: FilterConfig | None, count: int) -> list[str]:
     """Fly a row of the table, and time it."""
     controller, task = controller_named(name), TaskConfig()
-    flown = cases.fly_cases(controller, task, MonteCarloConfig(cases=count, substeps=rivals.SUBSTEPS, shield=config))
+    flown = cases.fly_cases(controller, task, MonteCarloConfig(cases=count, substeps=SUBSTEPS, shield=config))
     summary = summarise(flown)
     infeasible = np.asarray(flown.infeasible_steps)
     settles = np.any(flown.settled)
@@ -67,7 +67,7 @@ def fly(name: str, config: FilterConfig | None, count: int) -> list[str]:
         str(int(np.sum(infeasible))),
         str(int(np.sum(infeasible > 0))),
         f"{np.rad2deg(np.max(flown.peak_rate)):.1f}",
-        f"{rivals.decision_us(controller, task, config):.0f}",
+        f"{timing.decision_us(controller, task, config):.0f}",
     ]
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import model_validator
+from pydantic import Discriminator, Tag, model_validator
 
 from koz_jax.config.base import NonNegativeFloat, PositiveFloat, PositiveInt, Seed, Settings, Vector
 from koz_jax.config.shield import ShieldConfig
@@ -65,7 +65,19 @@ class ZohCbfConfig(Settings):
             )
 
 
+def _kind(given: Any) -> FilterName:
+    """Which filter settings are of; what could be of either is of the shield."""
+    names = given if isinstance(given, dict) else ()
+    of_other = any(name in ZohCbfConfig.model_fields and name not in ShieldConfig.model_fields for name in names)
+    return "zoh_cbf" if of_other or isinstance(given, ZohCbfConfig) else "shield"
+
+
 FilterConfig = ShieldConfig | ZohCbfConfig
+
+# Told apart by their fields, so that a refusal is about the one that was meant.
+AnyFilter = Annotated[
+    Annotated[ShieldConfig, Tag("shield")] | Annotated[ZohCbfConfig, Tag("zoh_cbf")], Discriminator(_kind)
+]
 
 
 def filter_named(name: FilterName) -> FilterConfig:

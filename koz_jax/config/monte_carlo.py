@@ -7,7 +7,7 @@ from typing import Self
 from pydantic import model_validator
 
 from koz_jax.config.base import CaseCount, CheckCount, DeviationDeg, NonNegativeInt, Seed, Settings
-from koz_jax.config.filters import FilterConfig
+from koz_jax.config.filters import AnyFilter
 from koz_jax.config.uncertainty import UncertaintyConfig
 
 
@@ -42,7 +42,7 @@ class CaseConfig(Settings):
 class MonteCarloConfig(CaseConfig):
     """Which cases are flown, under what conditions, and how they are checked."""
 
-    shield: FilterConfig | None = None
+    shield: AnyFilter | None = None
     """Fly under this shield, or under another safety filter such as ``ZohCbfConfig``; None flies without."""
     uncertainty: UncertaintyConfig | None = None
     """Errors to fly with; None flies the model itself."""

@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Discriminator, Tag, model_validator
+from pydantic import Discriminator, SerializerFunctionWrapHandler, Tag, model_serializer, model_validator
 
-from koz_jax.config import wheels
+from koz_jax.config.actuators import gyros, wheels
+from koz_jax.config.actuators.gyros import GyroConfig
+from koz_jax.config.actuators.wheels import WheelConfig
 from koz_jax.config.base import (
     HalfAngleDeg,
     NonNegativeFloat,
@@ -19,7 +21,6 @@ from koz_jax.config.base import (
     check_steps,
 )
 from koz_jax.config.spread import SpreadConfig
-from koz_jax.config.wheels import WheelConfig
 from koz_jax.errors import SettingsError
 
 
@@ -41,10 +42,14 @@ class SpacecraftConfig(Settings):
     boresight: Vector = (1.0, 0.0, 0.0)
     """Unit vector of the telescope in body axes."""
     torque_limit: TorqueLimit = 2.0
-    """Largest torque about each body axis [N m]: one number for all, or one for each; of no effect beside wheels."""
+    """Largest torque about each body axis [N m]: one number for all, or one for each; of no effect beside wheels
+    or gyros."""
     wheels: tuple[WheelConfig, ...] = ()
     """Reaction wheels that make the torque, at least three, of each its axis, largest torque [N m] and largest momentum
     [N m s], and its momentum at the start; none for actuators without momentum."""
+    gyros: tuple[GyroConfig, ...] = ()
+    """Control moment gyros in place of wheels, at least three, of each its gimbal axis, the axis of its rotor at gimbal
+    angle zero, its momentum [N m s], largest gimbal rate [deg/s], and gimbal angle at the start [deg]."""
     max_rate_deg: PositiveFloat | None = None
     """Largest norm of the body rate [deg/s], for agents that keep one; None sets no limit."""
 
@@ -53,8 +58,16 @@ class SpacecraftConfig(Settings):
         """Largest torque about each body axis [N m]; of wheels when the body is at rest, all axes at once."""
         if self.wheels:
             return wheels.torque_box(self.wheels)
+        if self.gyros:
+            return gyros.torque_box(self.gyros)
         limit = self.torque_limit
         return limit if isinstance(limit, tuple) else (limit, limit, limit)
+
+    @model_serializer(mode="wrap")
+    def _without_what_is_not_there(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Hashes of agents from before there were gyros stay as they are."""
+        written = serialize(self)
+        return written if self.gyros else {name: value for name, value in written.items() if name != "gyros"}
 
     @property
     def time_unit(self) -> float:
@@ -69,6 +82,11 @@ class SpacecraftConfig(Settings):
     @model_validator(mode="after")
     def _physical(self) -> Self:
         wheels.check_span(self.wheels)
+        gyros.check_span(self.gyros)
+        if self.wheels and self.gyros:
+            raise ValueError(
+                f"gyros: must be none beside wheels; got {len(self.gyros)} gyros and {len(self.wheels)} wheels"
+            )
         inertia = np.array(self.inertia)
         if not np.allclose(inertia, inertia.T, rtol=1e-6, atol=0.0):
             raise ValueError(f"inertia must be symmetric; got {self.inertia}")

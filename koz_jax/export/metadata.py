@@ -140,6 +140,8 @@ def describe(
 
 def _check(name: str, scaled: bool, task: TaskConfig, further: int) -> None:
     """Refuse what exports do not know."""
+    if task.spacecraft.gyros:
+        raise SettingsError("spacecraft.gyros: are not exported yet; allowed is torque_limit")
     if task.spacecraft.wheels:
         raise SettingsError("spacecraft.wheels: are not exported yet; allowed is torque_limit")
     if further and not scaled:

@@ -12,14 +12,19 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from koz_jax.config import wheels
+from koz_jax.config.actuators import wheels
 from koz_jax.config.task import SpacecraftConfig
 from koz_jax.task import dynamics, rotations
+from koz_jax.task.gyros import gimbals
+from koz_jax.task.gyros.gimbals import Gimbals
 
 ActuatorState = Any  # a pytree of fixed shapes; None where actuators have no state
 
 # Of wheels' torque, what braking counts on at any rate; the rest is for the gyroscopic torque of their momentum.
 BRAKE_SHARE = 0.5
+
+# Of a rotor's momentum, what all gyros together may hold for ``largest_rate``.
+ROTORS_USED = 1.0
 
 # Of wheels' torque, what controllers are told of at least, also where they are told of more than there is.
 LEAST_SHARE = 0.05
@@ -72,8 +77,8 @@ class Actuators(Protocol):
         ...
 
     @property
-    def brake_torque(self) -> jax.Array:
-        """Norm of the torque that is there in every direction up to the largest rate.  Returns () [N m]."""
+    def brake_torque(self) -> jax.Array | None:
+        """Norm of the torque that is there in every direction up to the largest rate; None for none.  () [N m]."""
         ...
 
 
@@ -145,12 +150,7 @@ class ReactionWheels(struct.PyTreeNode):
     ) -> tuple[jax.Array, jax.Array]:
         """Share the torque out.  Returns the torque (3,) [N m], and the momentum of each wheel (wheels,) after it."""
         wanted_B = self.limits(state, omega_BN_B).box_B * jnp.clip(command, -1.0, 1.0)
-        held_B = self.stored_momentum(state)
-        inverse_B = dynamics.inverse(inertia_B)
-        half = 0.5 * dt
-        omega_middle_B = omega_BN_B + half * dynamics.angular_acceleration(omega_BN_B, wanted_B, inertia_B, inverse_B)
-        held_middle_B = held_B - half * (wanted_B + rotations.cross(omega_BN_B, held_B))
-        each = self.allocation @ (wanted_B + rotations.cross(omega_middle_B, held_middle_B))
+        each = self.allocation @ _with_gyroscopic(wanted_B, self.stored_momentum(state), omega_BN_B, inertia_B, dt)
         size = jnp.maximum(jnp.abs(each), 1e-12 * self.max_torque)
         room = jnp.minimum(self.max_torque, (self.max_momentum + jnp.sign(each) * state) / dt)
         each = jnp.clip(jnp.min(room / size), 0.0, 1.0) * each
@@ -185,9 +185,76 @@ class ReactionWheels(struct.PyTreeNode):
         return BRAKE_SHARE * jnp.min(self.box_B)
 
 
+class GimbalState(struct.PyTreeNode):
+    """Where gimbals are."""
+
+    angles: jax.Array  # (gyros,) [rad]
+    seconds: jax.Array  # () [s] since the start
+
+
+class ControlMomentGyros(struct.PyTreeNode):
+    """Gyros that exchange momentum with the body.
+
+    A command asks for a torque as of a ``TorqueBox``, and the gimbals add what the gyros' momentum h takes: w x h, as
+    for ``ReactionWheels``.  Near singular arrangements the torque is another one than was asked for.
+    """
+
+    gimbals: Gimbals
+    angles: jax.Array  # (gyros,) [rad] at the start
+    box_B: jax.Array  # (3,) [N m] that controllers are told of
+
+    def initial_state(self) -> GimbalState:
+        """Gimbal angles at the start."""
+        return GimbalState(self.angles, jnp.zeros(()))
+
+    def limits(self, state: GimbalState, omega_BN_B: jax.Array) -> TorqueLimits:
+        """The box, wherever the gimbals are."""
+        return TorqueLimits(self.box_B)
+
+    def apply(
+        self, command: jax.Array, state: GimbalState, omega_BN_B: jax.Array, inertia_B: jax.Array, dt: jax.Array
+    ) -> tuple[jax.Array, GimbalState]:
+        """Turn the gimbals.  Returns the mean torque (3,) [N m] over the step, and where they are after it."""
+        wanted_B, held_B = self.box_B * jnp.clip(command, -1.0, 1.0), self.stored_momentum(state)
+        change_B = -_with_gyroscopic(wanted_B, held_B, omega_BN_B, inertia_B, dt)
+        # By the arrangement in the middle of the step, so that what is missed is of second order.
+        begin = self.gimbals.steer(state.angles, change_B, state.seconds)
+        rates = self.gimbals.steer(state.angles + 0.5 * dt * begin, change_B, state.seconds)
+        after = GimbalState(state.angles + dt * rates, state.seconds + dt)
+        return (held_B - self.stored_momentum(after)) / dt, after
+
+    def stored_momentum(self, state: GimbalState) -> jax.Array:
+        """Sum over the rotors.  Returns (3,) [N m s]."""
+        return self.gimbals.momentum(state.angles)
+
+    def largest_rate(self, state: GimbalState, omega_BN_B: jax.Array, inertia_B: jax.Array) -> jax.Array:
+        """The rate up to which the gyros hold ``ROTORS_USED`` rotors' momentum at most, at any attitude."""
+        total_B = dynamics.matvec(inertia_B, omega_BN_B) + self.stored_momentum(state)
+        room = ROTORS_USED * self.gimbals.unit - rotations.norm(total_B)
+        return jnp.maximum(room, 0.0) / jnp.linalg.eigvalsh(inertia_B)[2]
+
+    @property
+    def brake_torque(self) -> None:
+        """None: in a singular arrangement there is a direction without a torque."""
+        return
+
+
+def _with_gyroscopic(
+    wanted_B: jax.Array, held_B: jax.Array, omega_BN_B: jax.Array, inertia_B: jax.Array, dt: jax.Array
+) -> jax.Array:
+    """Add to a torque (3,) [N m] what stored momentum (3,) takes: w x h in the middle of the step.  Returns (3,)."""
+    half, inverse_B = 0.5 * dt, dynamics.inverse(inertia_B)
+    omega_middle_B = omega_BN_B + half * dynamics.angular_acceleration(omega_BN_B, wanted_B, inertia_B, inverse_B)
+    held_middle_B = held_B - half * (wanted_B + rotations.cross(omega_BN_B, held_B))
+    return wanted_B + rotations.cross(omega_middle_B, held_middle_B)
+
+
 def from_config(spacecraft: SpacecraftConfig) -> Actuators:
     """The actuators that the settings of a spacecraft ask for, float32."""
     box_B = jnp.array(spacecraft.torque_limits, jnp.float32)
+    if spacecraft.gyros:
+        angles = jnp.deg2rad(jnp.array([gyro.angle_deg for gyro in spacecraft.gyros], jnp.float32))
+        return ControlMomentGyros(gimbals.from_config(spacecraft.gyros), angles, box_B)
     if not spacecraft.wheels:
         return TorqueBox(box_B)
     of_each = {

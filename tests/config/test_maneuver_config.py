@@ -213,12 +213,12 @@ REFUSED = {
     "wheels": (
         "torque_limit = 0.004",
         "torque_limit = 0.004\n" + WHEEL.format("[1, 0, 0]") * 3,
-        "spacecraft: torque_limit: must be given where there are no wheels, and only there; got both",
+        "spacecraft: must have one of torque_limit, wheels and gyros; got torque_limit and wheels",
     ),
     "no actuators": (
         "torque_limit = 0.004",
         "",
-        "spacecraft: torque_limit: must be given where there are no wheels, and only there; got neither",
+        "spacecraft: must have one of torque_limit, wheels and gyros; got none",
     ),
     "half a wheel": (
         "torque_limit = 0.004",

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from koz_jax.config.actuators.wheels import WheelConfig
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import SpacecraftConfig, TaskConfig
-from koz_jax.config.wheels import WheelConfig
 from koz_jax.control.adversarial import AnyAdversary
 from koz_jax.control.registry import load_controller
 from koz_jax.control.shield.filter import under_shield

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from support import oracle
 
+from koz_jax.config.actuators.wheels import WheelConfig
 from koz_jax.config.task import SpacecraftConfig, TaskConfig
-from koz_jax.config.wheels import WheelConfig
 from koz_jax.task import dynamics
 from koz_jax.task.actuators import BRAKE_SHARE, ReactionWheels, from_config
 from koz_jax.task.environment import Reorientation, model_from_config

@@ -13,8 +13,9 @@ from pydantic import Field, ValidationError
 from pydantic.fields import FieldInfo
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
+from koz_jax.config.actuators.gyros import GyroConfig
+from koz_jax.config.actuators.wheels import WheelConfig
 from koz_jax.config.base import Settings
-from koz_jax.config.wheels import WheelConfig
 from koz_jax.errors import SettingsError, explain
 
 Flags = TypeVar("Flags", bound=Settings)
@@ -206,5 +207,26 @@ def _wheel(type_info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None
         is_instance=lambda instance: isinstance(instance, WheelConfig),
         str_from_instance=lambda wheel: [
             str(number) for number in (*wheel.axis, *list(wheel.model_dump().values())[1:])
+        ],
+    )
+
+
+@_REGISTRY.primitive_rule
+def _gyro(type_info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """A gyro is nine numbers: two axes, and then what else it has, in the order of its settings."""
+    if type_info.type is not GyroConfig:
+        return None
+    names = [*GyroConfig.model_fields]
+    return PrimitiveConstructorSpec(
+        nargs=4 + len(names),
+        metavar="GX GY GZ RX RY RZ MOMENTUM MAX-GIMBAL-RATE-DEG ANGLE-DEG",
+        instance_from_str=lambda args: {
+            "gimbal_axis": tuple(args[:3]),
+            "rotor_axis": tuple(args[3:6]),
+            **dict(zip(names[2:], args[6:], strict=True)),
+        },
+        is_instance=lambda instance: isinstance(instance, GyroConfig),
+        str_from_instance=lambda gyro: [
+            str(number) for number in (*gyro.gimbal_axis, *gyro.rotor_axis, *list(gyro.model_dump().values())[2:])
         ],
     )

@@ -8,6 +8,8 @@ import numpy as np
 from pydantic import AfterValidator, ValidationError, model_validator
 
 from koz_jax.config import attitudes
+from koz_jax.config.actuators.gyros import PyramidConfig
+from koz_jax.config.actuators.wheels import WheelConfig
 from koz_jax.config.base import (
     HalfAngleDeg,
     NonNegativeFloat,
@@ -18,7 +20,6 @@ from koz_jax.config.base import (
 )
 from koz_jax.config.task import SpacecraftConfig, TorqueLimit
 from koz_jax.config.uncertainty import DelaySteps, UncertaintyConfig
-from koz_jax.config.wheels import WheelConfig
 from koz_jax.errors import explain
 
 # By so much a direction or a quaternion may be longer or shorter than 1; more is a slip of the pen.
@@ -60,23 +61,29 @@ class WheelTable(Table, WheelConfig):
     """Its axis, in body axes; normalised on reading."""
 
 
+class GyrosTable(Table, PyramidConfig):
+    """Four control moment gyros in a pyramid about z."""
+
+
 class BodyConfig(Table):
     """The spacecraft's body and actuators."""
 
     inertia: tuple[Vector, Vector, Vector]
     """Inertia tensor in body axes, row by row [kg m^2]."""
     torque_limit: TorqueLimit | None = None
-    """Largest torque about each body axis [N m]: one number for all, or one for each; either this or wheels."""
+    """Largest torque about each body axis [N m]: one number for all, or one for each; either this, wheels or gyros."""
     wheels: tuple[WheelTable, ...] = ()
     """Reaction wheels, at least three, with axes that do not lie in a plane."""
+    gyros: GyrosTable | None = None
+    """Control moment gyros."""
     max_rate_deg: PositiveFloat | None = None
     """Largest norm of the body rate [deg/s]; kept by agents for any spacecraft."""
 
     @model_validator(mode="after")
     def _physical(self) -> Self:
-        if (self.torque_limit is None) != bool(self.wheels):
-            given = "both" if self.wheels else "neither"
-            raise ValueError(f"torque_limit: must be given where there are no wheels, and only there; got {given}")
+        given = [name for name in ("torque_limit", "wheels", "gyros") if getattr(self, name)]
+        if len(given) != 1:
+            raise ValueError(f"must have one of torque_limit, wheels and gyros; got {' and '.join(given) or 'none'}")
         try:
             self.spacecraft((1.0, 0.0, 0.0))
         except ValidationError as error:
@@ -97,6 +104,7 @@ class BodyConfig(Table):
             inertia=self.inertia,
             boresight=boresight,
             wheels=tuple(WheelConfig(**wheel.model_dump()) for wheel in self.wheels),
+            gyros=() if self.gyros is None else self.gyros.gyros,
             max_rate_deg=self.max_rate_deg,
             **limit,
         )

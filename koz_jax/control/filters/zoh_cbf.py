@@ -14,6 +14,7 @@ from koz_jax.control.filters import allowed_set, barrier, nearest_torque
 from koz_jax.control.filters.allowed_set import Limits
 from koz_jax.control.filters.barrier import Look, Motion
 from koz_jax.control.filters.nearest_torque import Ellipsoid, Halfspaces
+from koz_jax.errors import SettingsError
 from koz_jax.task import dynamics, pointing_constraints, rotations
 from koz_jax.task.any_spacecraft import units
 from koz_jax.task.pointing_constraints import PointingConstraint
@@ -118,7 +119,17 @@ def _least_bad(measured: EnvState, box_B: jax.Array, cones: Halfspaces, energy: 
 
 
 def from_config(config: ZohCbfConfig, model: Model) -> ZohCbf:
-    """Make a filter for a spacecraft: look for its bounds in the states that it may be in."""
+    """Make a filter for a spacecraft: look for its bounds in the states that it may be in.
+
+    Raises:
+        SettingsError: its actuators do not have their torque box at all times.
+
+    """
+    if model.actuators.brake_torque is None:
+        raise SettingsError(
+            "zoh_cbf: must have all of a torque box at its disposal, and control moment gyros do not in a singular"
+            " arrangement; allowed are a torque_limit or wheels"
+        )
     rate = config.max_rate / units.of(model).time
     of_spacecraft = nominal_rate(model)
     if of_spacecraft is not None:

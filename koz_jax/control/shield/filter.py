@@ -17,6 +17,7 @@ from koz_jax.control.shield import brake_path, guide, rate_limit
 from koz_jax.control.shield.brake_path import Brake
 from koz_jax.control.shield.guide import Guide
 from koz_jax.control.shield.rate_limit import RateLimit
+from koz_jax.errors import SettingsError
 from koz_jax.task import dynamics, pointing_constraints, rotations
 from koz_jax.task.actuators import TorqueLimits
 from koz_jax.task.dynamics import RigidBodyState
@@ -144,8 +145,18 @@ class _Search(struct.PyTreeNode):
 
 
 def from_config(config: ShieldConfig, model: Model) -> Shield:
-    """Make a shield for a spacecraft, with a margin for the errors that ``config`` has to withstand."""
-    errors = config.error_bounds
+    """Make a shield for a spacecraft, with a margin for the errors that ``config`` has to withstand.
+
+    Raises:
+        SettingsError: its actuators have no torque that is always there to brake with.
+
+    """
+    errors, brake_torque = config.error_bounds, model.actuators.brake_torque
+    if brake_torque is None:
+        raise SettingsError(
+            "shield: must have a torque in every direction to brake with, and control moment gyros have none in a"
+            " singular arrangement; allowed are a torque_limit or wheels"
+        )
     limits = nominal_limits(model)
     attitude_error, rate_error = (
         jnp.deg2rad(jnp.float32(NOISE_BOUND * np.sqrt(3.0) * deviation + bias))
@@ -156,7 +167,7 @@ def from_config(config: ShieldConfig, model: Model) -> Shield:
     )
     moments = jnp.linalg.eigvalsh(model.inertia_B)
     brake = Brake(
-        torque=model.actuators.brake_torque - errors.disturbance_torque,
+        torque=brake_torque - errors.disturbance_torque,
         inertia_error=jnp.float32(errors.inertia_error),
         disturbance=jnp.float32(errors.disturbance_torque),
         rate_error=rate_error,

@@ -33,9 +33,11 @@ def of(spacecraft: SpacecraftConfig, step_seconds: float, boresight: npt.ArrayLi
     step_seconds: time step [s]; boresight: (3,) unit vector of an instrument in body axes, by default the spacecraft's.
 
     Raises:
-        SettingsError: it has wheels, whose limits are no constants.
+        SettingsError: it has wheels or gyros, whose limits are no constants.
 
     """
+    if spacecraft.gyros:
+        raise SettingsError("spacecraft.gyros: are flown by jax only so far; allowed here is torque_limit")
     if spacecraft.wheels:
         raise SettingsError("spacecraft.wheels: are flown by jax only so far; allowed here is torque_limit")
     axes = policy_axes(host.unit("boresight", spacecraft.boresight if boresight is None else boresight, 3))

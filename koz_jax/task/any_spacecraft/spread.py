@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from koz_jax.config.actuators.wheels import WheelConfig
 from koz_jax.config.spread import SpreadConfig
 from koz_jax.config.task import SpacecraftConfig, TaskConfig
-from koz_jax.config.wheels import WheelConfig
 from koz_jax.task import actuators, rotations
 from koz_jax.task.actuators import Actuators, ReactionWheels, TorqueBox
 from koz_jax.task.any_spacecraft import units

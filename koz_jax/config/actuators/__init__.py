@@ -1,0 +1,1 @@
+"""Settings of actuators that exchange momentum with the body."""

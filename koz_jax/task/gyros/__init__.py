@@ -1,0 +1,1 @@
+"""Single-gimbal control moment gyros: what their gimbals do."""
