@@ -11,7 +11,11 @@ from koz_jax.config.task import TaskConfig
 from koz_jax.control import registry
 from koz_jax.control.adversarial import Adversary, BangBang, Random, SpinUp
 from koz_jax.control.base import Controller
+from koz_jax.control.planning.icosphere_astar import IcosphereAStar
+from koz_jax.control.planning.mrp_astar import MRPAStar
 from koz_jax.control.planning.path_planner import PathPlanner
+from koz_jax.control.planning.path_tracking import PathTracker
+from koz_jax.control.planning.rrt import RRT
 from koz_jax.control.potential import PotentialFeedback
 from koz_jax.control.published.lee_mesbahi import LeeMesbahiBackstepping, LeeMesbahiPD
 from koz_jax.control.published.yang_sliding import YangSliding
@@ -35,10 +39,14 @@ CLASSICAL = [
     LeeMesbahiBackstepping(),
     YangSliding(),
     PathPlanner(rounds=0),
+    # Coarse, for the time that it takes.
+    IcosphereAStar(halvings=2, reach=0.6, points=33, eased=1, tried=1),
+    MRPAStar(half_axis=5, points=65, eased=8, tried=2),
+    RRT(nodes=32, points=33, eased=1, tried=1),
 ]
 
 # These compile for long.
-_SLOW = (PathPlanner, PotentialSliding, LeeMesbahiBackstepping, YangSliding)
+_SLOW = (PathTracker, PotentialSliding, LeeMesbahiBackstepping, YangSliding)
 
 STEPS = 40
 
@@ -73,7 +81,8 @@ def actions(controller: Controller, at: EnvState, model: Model = states.MODEL) -
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_actions_are_finite_and_in_the_box_everywhere(name):
-    controller = PathPlanner(rounds=0) if name == "planner" else registry.load_controller(name).controller
+    loaded = registry.load_controller(name).controller
+    controller = CLASSICAL[NAMES.index(name)] if isinstance(loaded, PathTracker) else loaded
     for at in (states.special_states(), states.random_states(32, 5, rate=1.0)):
         found = actions(controller, at)
         assert np.all(np.isfinite(found))

@@ -7,7 +7,6 @@ stop, then a forward pass along the limit (H. Pham, Q.-C. Pham, "A new approach 
 based on reachability analysis", IEEE Transactions on Robotics 34 (2018)).
 """
 
-import functools
 import itertools
 from typing import Protocol
 
@@ -28,6 +27,10 @@ class Path(Protocol):
         """q(s).  s: () in [0, 1].  Returns (4,), continuous also in its sign."""
         ...
 
+    def attitude_and_slope(self, s: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """q(s) (4,), and the body rate (3,) [rad] per unit of s."""
+        ...
+
 
 class AttitudePath(struct.PyTreeNode):
     """An eigen-axis turn bent aside, without timing."""
@@ -42,6 +45,11 @@ class AttitudePath(struct.PyTreeNode):
         bend_B = jnp.sum(sines[:, None] * self.bends_B, axis=0)
         aside = rotations.multiply(self.q_end, feedback.from_rotation_vector(bend_B))
         return rotations.multiply(aside, feedback.from_rotation_vector((s - 1.0) * self.turn_B))
+
+    def attitude_and_slope(self, s: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """q(s) (4,), and the body rate (3,) [rad] per unit of s."""
+        q, slope = jax.jvp(self.attitude, (s,), (jnp.ones_like(s),))
+        return q, 2.0 * rotations.multiply(rotations.conjugate(q), slope)[1:]
 
 
 class Timing(struct.PyTreeNode):
@@ -76,15 +84,9 @@ class Samples(struct.PyTreeNode):
     slope_B: jax.Array  # (points, 3) [rad] body rate per unit of s
 
 
-def attitude_and_slope(path: Path, s: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """q(s) (4,), and the body rate (3,) [rad] per unit of s."""
-    q, slope = jax.jvp(path.attitude, (s,), (jnp.ones_like(s),))
-    return q, 2.0 * rotations.multiply(rotations.conjugate(q), slope)[1:]
-
-
 def sample(path: Path, points: int) -> Samples:
     """Sample a path at so many points, both ends included."""
-    return Samples(*jax.vmap(functools.partial(attitude_and_slope, path))(jnp.linspace(0.0, 1.0, points)))
+    return Samples(*jax.vmap(path.attitude_and_slope)(jnp.linspace(0.0, 1.0, points)))
 
 
 def clearance(samples: Samples, zones: PointingConstraint, timing: Timing) -> jax.Array:

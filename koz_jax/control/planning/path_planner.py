@@ -15,7 +15,7 @@ from flax import struct
 
 from koz_jax.control import feedback
 from koz_jax.control.planning import attitude_path
-from koz_jax.control.planning.attitude_path import AttitudePath
+from koz_jax.control.planning.attitude_path import AttitudePath, Timing
 from koz_jax.control.planning.path_tracking import PathTracker
 from koz_jax.task import rotations
 from koz_jax.task.state import EnvState, Model
@@ -42,18 +42,19 @@ class PathPlanner(PathTracker):
     candidates: int = struct.field(pytree_node=False, default=32)  # of a round of refinement
     rounds: int = struct.field(pytree_node=False, default=16)
 
-    def path(self, state: EnvState, model: Model, key: jax.Array) -> AttitudePath:
-        """Search for a path from the state to its target."""
+    def search(self, state: EnvState, model: Model, key: jax.Array) -> tuple[AttitudePath, Timing]:
+        """Search for the fastest bend that keeps its distance."""
 
         def bent(bends_B: jax.Array) -> AttitudePath:
             return attitude_path.from_state(state.body, state.scenario.q_DN, bends_B)
 
         def cost(bends_B: jax.Array) -> jax.Array:
-            return self.cost(bent(bends_B), state, model)
+            return self.judged(bent(bends_B), state, model)[0]
 
-        return bent(self._search(cost, self._first_bends(state), key))
+        path = bent(self._refined(cost, self._first_bends(state), key))
+        return path, self.timed(path, state, model)[1]
 
-    def _search(self, cost: Callable[[jax.Array], jax.Array], first_B: jax.Array, key: jax.Array) -> jax.Array:
+    def _refined(self, cost: Callable[[jax.Array], jax.Array], first_B: jax.Array, key: jax.Array) -> jax.Array:
         """Cross-entropy search from the best of the first bends (n, sines, 3).  Returns the best found (sines, 3)."""
         order = 1.0 / jnp.arange(1.0, self.sines + 1)[None, :, None]
         elite = max(self.candidates // 4, 1)

@@ -34,7 +34,7 @@ class Plan(struct.PyTreeNode):
     def reference(self, time: jax.Array, pace: jax.Array) -> RigidBodyState:
         """Where the body should be at a time () [s] of the plan whose clock goes at a pace ()."""
         s, speed = self.timing.at(time)
-        q, slope_B = attitude_path.attitude_and_slope(self.path, s)
+        q, slope_B = self.path.attitude_and_slope(s)
         return RigidBodyState(q, pace * speed * slope_B)
 
     def error(self, body: RigidBodyState) -> jax.Array:
@@ -75,28 +75,29 @@ class PathTracker(struct.PyTreeNode):
     patience: Gain = 0.0425  # () [rad] tracking error at which the plan waits
     points: int = struct.field(pytree_node=False, default=49)  # at which a path is timed
 
-    def path(self, state: EnvState, model: Model, key: jax.Array) -> Path:
-        """Search for a path from the state to its target.  key: () typed PRNG key."""
+    def search(self, state: EnvState, model: Model, key: jax.Array) -> tuple[Path, Timing]:
+        """Find a path from the state to its target, and time it.  key: () typed PRNG key."""
         raise NotImplementedError
 
     def begin(self, state: EnvState, model: Model, key: jax.Array) -> Plan:
-        """Search, and time what is found."""
+        """Search for a path from the state to its target."""
         key, key_search = jax.random.split(key)
-        path = self.path(state, model, key_search)
-        return Plan(path, self._timed(path, state, model)[1], jnp.zeros(()), key)
+        path, timing = self.search(state, model, key_search)
+        return Plan(path, timing, jnp.zeros(()), key)
 
-    def _timed(self, path: Path, state: EnvState, model: Model) -> tuple[Samples, Timing]:
-        samples = attitude_path.sample(path, self.points)
+    def timed(self, path: Path, state: EnvState, model: Model) -> tuple[Samples, Timing]:
+        """Sample a path, and time it as fast as the spacecraft can follow."""
+        samples = jax.lax.optimization_barrier(attitude_path.sample(path, self.points))
         limit_B = self.torque_share * torque_limits(state, model).box_B
         most = _max_speed(samples, state, model)
         return samples, attitude_path.fastest_timing(samples, model.inertia_B, limit_B, most)
 
-    def cost(self, path: Path, state: EnvState, model: Model) -> jax.Array:
-        """How long a path takes () [s], and more where it comes too close to a zone."""
-        samples, timing = self._timed(path, state, model)
+    def judged(self, path: Path, state: EnvState, model: Model) -> tuple[jax.Array, Timing]:
+        """How long a path takes () [s], and more where it comes too close to a zone; and its timing."""
+        samples, timing = self.timed(path, state, model)
         clear = attitude_path.clearance(samples, state.scenario.constraints, timing)
         per_shortfall = _TIME_PER_SHORTFALL * units.of(model).time
-        return timing.duration + per_shortfall * jnp.maximum(self.margin - clear, 0.0)
+        return timing.duration + per_shortfall * jnp.maximum(self.margin - clear, 0.0), timing
 
     def decide(self, state: EnvState, model: Model, memory: Plan) -> tuple[jax.Array, Plan]:
         """Action (3,), and the plan with its clock moved on."""
