@@ -11,6 +11,7 @@ from koz_jax.config.task import TaskConfig
 from koz_jax.control.base import Memoryless
 from koz_jax.evaluation.cases import fly_cases
 from koz_jax.evaluation.summary import Summary, summarise
+from koz_jax.sac.networks import Encoding, encode
 from koz_jax.task import observation
 from koz_jax.task.observation_layout import ACTION_SIZE
 from koz_jax.task.state import EnvState, Model
@@ -27,10 +28,11 @@ class MlpController(Memoryless):
     weights: tuple[jax.Array, ...]  # (inputs, outputs) each
     biases: tuple[jax.Array, ...]  # (outputs,) each
     activation: Callable[[jax.Array], jax.Array] = struct.field(pytree_node=False)
+    encoding: Encoding = struct.field(pytree_node=False, default=())
 
     def act(self, observed: jax.Array) -> jax.Array:
         """Action (3,) in [-1, 1] for an observation (16,)."""
-        hidden = (observed - self.mean) / self.std
+        hidden = encode((observed - self.mean) / self.std, self.encoding)
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             hidden = self.activation(hidden @ weight + bias)
         return jnp.tanh(hidden @ self.weights[-1] + self.biases[-1])[:ACTION_SIZE]
