@@ -25,6 +25,7 @@ _DEEPEST = 0.9  # share of the half angle
 _SLOWEST, _FASTEST = 1e-3, 4.0  # momentum in steps of the brake
 
 _DRAWN_PER_VECTOR = 20  # few requests are refused
+_TRIED_PER_VECTOR = 3  # of those drawn, whether roundings could decide otherwise
 
 # What rounding changes is far smaller, and what these change in a torque that is decided alike is below the last.
 _MARGIN_SHIFT = 2e-5  # [rad]
@@ -81,6 +82,9 @@ def shield_golden(
     drawn, kind = shield_situations(agent, config, _DRAWN_PER_VECTOR * count, seed, further_boresights)
     box = np.random.default_rng(seed).uniform(np.negative(limits), limits, (_DRAWN_PER_VECTOR * count, 3))
     requested = box.astype(np.float32)
+    allowed, _ = _answer(made, drawn, requested, model, boresights_B, _Variant())
+    tried = _in_turn(np.arange(len(kind)), 2 * kind + np.all(allowed == requested, axis=1))[: _TRIED_PER_VECTOR * count]
+    drawn, requested, kind = jax.tree.map(lambda leaf: leaf[tried], (drawn, requested, kind))
     answers = [_answer(made, drawn, requested, model, boresights_B, variant) for variant in _variants()]
     allowed, safe = (np.stack(answer) for answer in zip(*answers, strict=True))
     steady = np.all(np.ptp(allowed, axis=0) < _STEADY * np.array(limits), axis=1) & (safe[0] == safe).all(axis=0)
