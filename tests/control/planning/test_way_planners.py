@@ -15,7 +15,7 @@ from koz_jax.control.planning.way_planner import WayPlanner
 from koz_jax.evaluation import maneuver
 from koz_jax.task import rotations
 
-MAZE = maneuver.scenario(load_maneuver(tiny.ROOT / "examples" / "maze.toml"))
+MAZE = maneuver.scenario(load_maneuver(tiny.MANEUVER_FILES["maze"]))
 COUNT = 4
 
 
