@@ -1,4 +1,4 @@
-"""Who learns is a setting: a run with another learner, and what its agent is."""
+"""Who learns is a setting: what it makes of a run, and of its agent."""
 
 import jax
 import jax.numpy as jnp
@@ -7,40 +7,42 @@ import pytest
 from pydantic import ValidationError
 from support import tiny
 
-from koz_jax.agents.agent import load_agent
+from koz_jax.agents.agent import Agent
+from koz_jax.agents.numpy_policy import load_policy
+from koz_jax.agents.record import Provenance
 from koz_jax.config.training import TrainConfig
+from koz_jax.control.policy import PolicyController
 from koz_jax.errors import SettingsError
 from koz_jax.learners.td3 import Td3
-from koz_jax.learning import learners
+from koz_jax.learning import learners, train_step
 from koz_jax.runs import checkpoint
-from koz_jax.runs.folder import RunFolder
-from koz_jax.runs.trainer import train
 from koz_jax.sac.learner import Sac
 from koz_jax.task.reward import Outcome
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """A whole run of DDPG, whose second phase draws by priority."""
-    config = tiny.changed({"learner": "ddpg", "refine": {"iterations": 0}})
-    path = tmp_path_factory.mktemp("runs") / "ddpg"
-    train(config, path, progress=False)
-    return RunFolder(path)
-
-
 @pytest.mark.slow
-def test_the_agent_of_a_run_is_like_any_other(run):
-    agent = load_agent(run.path)
-    assert agent.provenance.phase == 2
+def test_ddpg_learns_by_priority_and_its_agent_is_like_any_other(tmp_path):
+    config = tiny.changed({"learner": "ddpg", "curriculum": {"phase1": {"updates": 0}}, "refine": {"iterations": 0}})
+    begun = checkpoint.begin(config, None)
+    before = jax.tree.map(np.array, begun.train.learner.averaged_policy)
+    trained, metrics = train_step.train_chunk(config, begun.train, jnp.int32(4))
+    policy = trained.learner.averaged_policy
+    assert not any(np.array_equal(*pair) for pair in zip(*map(_weights, (before, policy)), strict=True))
+    assert all(np.isfinite(jax.tree.leaves(metrics.learner)))
+
+    agent = Agent(PolicyController(policy, config.network), config.task, Provenance(), "ddpg")
+    agent.save(tmp_path / "agent")
     observed = np.random.default_rng(0).normal(size=(20, 16)).astype(np.float32)
-    np.testing.assert_allclose(agent.to_numpy().predict(observed), agent.predict(observed), atol=1e-5)
-    assert "ddpg" in run.config.read_text() and "td3" not in run.config.read_text()
+    np.testing.assert_allclose(load_policy(tmp_path / "agent").predict(observed), agent.predict(observed), atol=1e-5)
 
-
-@pytest.mark.slow
-def test_another_learner_cannot_begin_from_it(run):
+    checkpoint.save(tmp_path / "snapshot", begun.replace(train=trained), config)
     with pytest.raises(SettingsError, match=r"start_from: learner must be ddpg.*got sac"):
-        checkpoint.load_source(run.path, tiny.UNREFINED)
+        checkpoint.load_source(tmp_path / "snapshot", tiny.UNREFINED)
+
+
+def _weights(policy):
+    """Matrices of the hidden layers; of the last, half is for a deviation that has no gradient."""
+    return [policy["params"]["Mlp_0"][f"Dense_{i}"]["kernel"] for i in range(2)]
 
 
 def test_the_setting_says_who_learns():
