@@ -45,11 +45,10 @@ class SpacecraftConfig(Settings):
     """Largest torque about each body axis [N m]: one number for all, or one for each; of no effect beside wheels
     or gyros."""
     wheels: tuple[WheelConfig, ...] = ()
-    """Reaction wheels that make the torque, at least three, of each its axis, largest torque [N m] and largest momentum
-    [N m s], and its momentum at the start; none for actuators without momentum."""
+    """Reaction wheels that make the torque, at least three, of each its axis, largest torque [N m], largest
+    momentum [N m s] and momentum at the start; none for actuators without momentum."""
     gyros: tuple[GyroConfig, ...] = ()
-    """Control moment gyros in place of wheels, at least three, of each its gimbal axis, the axis of its rotor at gimbal
-    angle zero, its momentum [N m s], largest gimbal rate [deg/s], and gimbal angle at the start [deg]."""
+    """Control moment gyros in place of wheels, at least three, as of ``GyroConfig``."""
     max_rate_deg: PositiveFloat | None = None
     """Largest norm of the body rate [deg/s], for agents that keep one; None sets no limit."""
 
