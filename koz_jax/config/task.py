@@ -45,8 +45,7 @@ class SpacecraftConfig(Settings):
     """Largest torque about each body axis [N m]: one number for all, or one for each; of no effect beside wheels
     or gyros."""
     wheels: tuple[WheelConfig, ...] = ()
-    """Reaction wheels that make the torque, at least three, of each its axis, largest torque [N m], largest
-    momentum [N m s] and momentum at the start; none for actuators without momentum."""
+    """Reaction wheels, at least three: axis, largest torque [N m], largest momentum [N m s], and that at the start."""
     gyros: tuple[GyroConfig, ...] = ()
     """Control moment gyros in place of wheels, at least three, as of ``GyroConfig``."""
     max_rate_deg: PositiveFloat | None = None

@@ -213,13 +213,13 @@ def _wheel(type_info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None
 
 @_REGISTRY.primitive_rule
 def _gyro(type_info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    """A gyro is nine numbers: two axes, and then what else it has, in the order of its settings."""
+    """A gyro is nine numbers: its two axes, and then what else it has, in the order of its settings."""
     if type_info.type is not GyroConfig:
         return None
     names = [*GyroConfig.model_fields]
     return PrimitiveConstructorSpec(
         nargs=4 + len(names),
-        metavar="GX GY GZ RX RY RZ MOMENTUM MAX-GIMBAL-RATE-DEG ANGLE-DEG",
+        metavar="NINE NUMBERS",
         instance_from_str=lambda args: {
             "gimbal_axis": tuple(args[:3]),
             "rotor_axis": tuple(args[3:6]),
