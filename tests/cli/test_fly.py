@@ -15,6 +15,7 @@ from koz_jax.cli.flags import parsing
 from koz_jax.cli.fly import FlyFlags
 from koz_jax.config.maneuvers.maneuver_file import load_maneuver
 from koz_jax.config.task import TaskConfig
+from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.evaluation import cases
 
@@ -142,7 +143,7 @@ def test_errors_come_from_the_file_or_from_flags_and_are_what_robust_withstands(
     (tmp_path / "mine.toml").write_text(PAPER.read_text() + "\n[errors]\ninertia = 0.1\n")
     config = parsed(tmp_path / "mine.toml", "--shield", "--robust").config()
     assert config.uncertainty == UncertaintyConfig(inertia_error=0.1)
-    assert config.shield is not None and config.shield.error_bounds == config.uncertainty
+    assert isinstance(config.shield, ShieldConfig) and config.shield.error_bounds == config.uncertainty
     assert config.substeps == 5 and parsed(PAPER, "--substeps", 9).config().substeps == 9
     assert parsed("--json", "x.json").config().substeps == 5 and parsed().config().substeps == 1
     assert parsed(PAPER, "--inertia-error", 0.2).config().uncertainty == UncertaintyConfig(inertia_error=0.2)

@@ -51,7 +51,7 @@ def test_a_box_with_one_limit_is_the_scalar_of_before(limit):
     torques_B = jax.vmap(lambda command: apply(actuators, command)[0])(commands)
     np.testing.assert_array_equal(torques_B, np.float32(limit) * np.clip(commands, -1.0, 1.0))
     limits = actuators.limits(None, AT_REST)
-    assert float(actuators.brake_torque) == np.float32(limit)
+    assert actuators.brake_torque == np.float32(limit)
     assert float(limits.scale) == pytest.approx(limit, rel=1e-6)
     assert float(limits.largest) == pytest.approx(np.sqrt(3.0) * limit, rel=1e-6)
 
