@@ -14,8 +14,8 @@ from support import tiny
 from koz_jax.cli.flags import parsing
 from koz_jax.cli.fly import FlyFlags
 from koz_jax.config.maneuvers.maneuver_file import load_maneuver
-from koz_jax.config.task import TaskConfig
 from koz_jax.config.shield import ShieldConfig
+from koz_jax.config.task import TaskConfig
 from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.evaluation import cases
 
