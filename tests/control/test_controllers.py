@@ -12,10 +12,9 @@ from koz_jax.control import registry
 from koz_jax.control.adversarial import Adversary, BangBang, Random, SpinUp
 from koz_jax.control.base import Controller
 from koz_jax.control.planning.icosphere_astar import IcosphereAStar
-from koz_jax.control.planning.mrp_astar import MRPAStar
 from koz_jax.control.planning.path_planner import PathPlanner
 from koz_jax.control.planning.path_tracking import PathTracker
-from koz_jax.control.planning.rrt import RRT
+from koz_jax.control.planning.way_planner import WayPlanner
 from koz_jax.control.potential import PotentialFeedback
 from koz_jax.control.published.lee_mesbahi import LeeMesbahiBackstepping, LeeMesbahiPD
 from koz_jax.control.published.yang_sliding import YangSliding
@@ -27,23 +26,19 @@ from koz_jax.task.actuators import TorqueBox
 from koz_jax.task.any_spacecraft import units
 from koz_jax.task.state import EnvState, Model
 
-NAMES = (*registry.CLASSICAL, *registry.ADVERSARIAL)
-
-
 # Refinement chooses among near equals, and rounding may decide; without it the planner is compared exactly.
-CLASSICAL = [
-    QuaternionFeedback(),
-    PotentialFeedback(),
-    PotentialSliding(),
-    LeeMesbahiPD(),
-    LeeMesbahiBackstepping(),
-    YangSliding(),
-    PathPlanner(rounds=0),
-    # Coarse, for the time that it takes.
-    IcosphereAStar(halvings=2, reach=0.6, points=33, eased=1, tried=1),
-    MRPAStar(half_axis=5, points=65, eased=8, tried=2),
-    RRT(nodes=32, points=33, eased=1, tried=1),
-]
+CLASSICAL: dict[str, Controller] = {
+    "pd": QuaternionFeedback(),
+    "potential": PotentialFeedback(),
+    "sliding": PotentialSliding(),
+    "lee_mesbahi_pd": LeeMesbahiPD(),
+    "lee_mesbahi_backstepping": LeeMesbahiBackstepping(),
+    "yang_sliding": YangSliding(),
+    "planner": PathPlanner(rounds=0),
+    # Coarse, for the time that it takes; it stands for all that search for a way, whose tests are in ``planning``.
+    "icosphere_astar": IcosphereAStar(halvings=2, reach=0.6, points=33, eased=1, tried=1),
+}
+NAMES = (*CLASSICAL, *registry.ADVERSARIAL)
 
 # These compile for long.
 _SLOW = (PathTracker, PotentialSliding, LeeMesbahiBackstepping, YangSliding)
@@ -78,11 +73,15 @@ def actions(controller: Controller, at: EnvState, model: Model = states.MODEL) -
     return np.asarray(_fly(controller, at, model, keys, jnp.int32(1))[0])
 
 
+def test_every_controller_is_tried_or_searches_as_one_that_is():
+    others = [registry.load_controller(name).controller for name in registry.CLASSICAL if name not in CLASSICAL]
+    assert all(isinstance(other, WayPlanner) for other in others)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_actions_are_finite_and_in_the_box_everywhere(name):
-    loaded = registry.load_controller(name).controller
-    controller = CLASSICAL[NAMES.index(name)] if isinstance(loaded, PathTracker) else loaded
+    controller = CLASSICAL.get(name) or registry.load_controller(name).controller
     for at in (states.special_states(), states.random_states(32, 5, rate=1.0)):
         found = actions(controller, at)
         assert np.all(np.isfinite(found))
@@ -90,7 +89,7 @@ def test_actions_are_finite_and_in_the_box_everywhere(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("controller", CLASSICAL, ids=registry.CLASSICAL)
+@pytest.mark.parametrize("controller", CLASSICAL.values(), ids=CLASSICAL)
 def test_turning_the_inertial_frame_changes_nothing(controller):
     at = states.random_states(32, 11)
     turn = states.quaternions(1, 17)[0]
@@ -117,7 +116,7 @@ def test_zones_matter_to_all_but_pd():
     # From NumPy, as the other states are: what JAX fills with a number of Python is compiled anew.
     absent = jax.tree.map(lambda leaf: jnp.asarray(np.stack([leaf] * 32)), pointing_constraints.absent(3, states.LOOK))
     without = at.replace(scenario=at.scenario.replace(constraints=absent))
-    for name, controller in zip(registry.CLASSICAL, CLASSICAL, strict=True):
+    for name, controller in CLASSICAL.items():
         same = np.all(actions(controller, at) == actions(controller, without), axis=1)
         assert same.all() if name == "pd" else not same.all(), name
 
@@ -144,7 +143,7 @@ ADVERSARIAL = [Random(), Adversary(), BangBang(hold=jnp.float32(0.3)), SpinUp(sp
     "controller",
     [
         pytest.param(one, id=type(one).__name__, marks=pytest.mark.slow if isinstance(one, _SLOW) else ())
-        for one in (*CLASSICAL, *ADVERSARIAL)
+        for one in (*CLASSICAL.values(), *ADVERSARIAL)
     ],
 )
 def test_all_spacecraft_of_a_shape_fly_one_maneuver_in_their_own_time(controller):
@@ -185,7 +184,7 @@ UNEQUAL = states.model_with(torque_limit=(0.5, 2.0, 1.2))
     "controller",
     [
         pytest.param(one, id=name, marks=pytest.mark.slow if isinstance(one, _SLOW) else ())
-        for one, name in zip(CLASSICAL, registry.CLASSICAL, strict=True)
+        for name, one in CLASSICAL.items()
     ],
 )
 def test_unequal_limits_are_kept_and_used(controller):

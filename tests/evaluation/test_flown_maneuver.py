@@ -257,11 +257,10 @@ def _with_margins(flown: FlownManeuver, count: int) -> FlownManeuver:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", EXAMPLES)
+@pytest.mark.parametrize("name", [name for name, one in EXAMPLES.items() if one.spacecraft.gyros is None])
 def test_the_shield_keeps_every_example(name):
-    """Quaternion feedback knows no cone; under the shield none is entered."""
-    # As many steps as the longest has, so that those with equally many cones are one program.
-    assert EXAMPLES[name].task.episode_steps <= 1000
+    """Quaternion feedback knows no cone; under the shield none is entered.  It refuses gyros."""
+    # Of each as many steps, so that those with equally many cones are one program.
     flying = changed(name, duration_seconds=1000 * EXAMPLES[name].task.step_seconds)
     report = koz_jax.fly(flying, "pd", shield=ShieldConfig()).report()
     assert not report["violated"] and report["min_margin_deg"] > 0.0
