@@ -122,8 +122,6 @@ _ANY = SpreadConfig(
     urgency=(0.0, 1.0),
     errors=UncertaintyConfig(inertia_error=0.1, disturbance_torque=0.01, attitude_noise_deg=0.01, rate_noise_deg=0.001),
     delay_steps=(0, 2),
-    # Who flies without errors and in a hurry is not to wait for what others need.
-    nominal=0.5,
 )
 
 
@@ -140,7 +138,7 @@ def _universal() -> TrainConfig:
         "horizon_seconds": 45.0,
         "optimizer": "muon",
         "learning_rate": 3e-3,
-        "effort_weight": 4.0,
+        "effort_weight": 3.46,
         "urgency_factor": 14.0,
         "rate_weight": 20.0,
         "change_weight": 5.0,
