@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from koz_jax.config.base import Fraction, PositiveFloat, Settings, ZoneCount
 from koz_jax.config.uncertainty import CERTAIN, DelaySteps, UncertaintyConfig
@@ -62,6 +62,12 @@ class SpreadConfig(Settings):
             if limits is not None and limits[0] > limits[1]:
                 raise ValueError(f"{name} must be in order; got {limits}")
         return self
+
+    @model_serializer(mode="wrap")
+    def _without_what_is_not_there(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Hashes of agents from before there were nominal maneuvers stay as they are."""
+        written = serialize(self)
+        return written if self.nominal else {name: value for name, value in written.items() if name != "nominal"}
 
     @property
     def is_none(self) -> bool:
