@@ -1,6 +1,6 @@
 """Everybody over published maneuvers and over random cases, as ``koz evaluate --suite``: one table for the docs.
 
-    python benchmarks/suite.py [--controllers NAME ...] [--cases N] [--markdown FILE]
+    python benchmarks/suite.py [--controllers NAME ...] [--unfiltered] [--cases N] [--markdown FILE]
 
 The file is written after each row, and keeps the rows of others.  Times per decision and for planning are of one
 maneuver alone, on one core.
@@ -25,6 +25,7 @@ def main(argv: list[str]) -> int:
     """Print the table.  Returns the exit status."""
     parser = argparse.ArgumentParser(prog="benchmarks/suite.py", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--controllers", nargs="*", default=suite.EVERYBODY, help="by default everybody")
+    parser.add_argument("--unfiltered", action="store_true", help="fly without a filter only")
     parser.add_argument("--cases", type=int, default=1000, help="random cases of the paper's task")
     parser.add_argument("--markdown", type=Path, help="write the table, or add to it, for docs/results/")
     args = parser.parse_args(argv)
@@ -37,7 +38,8 @@ def _fly_all(args: argparse.Namespace) -> int:
     order = list(suite.labels(maneuvers, suite.EVERYBODY, FILTERS))
     table = stamp.GrowingTable(args.markdown, "benchmarks/suite.py", suite.COLUMNS, order)
     draw = MonteCarloConfig(cases=args.cases, substeps=SUBSTEPS)
-    for flight in suite.fly_suite(maneuvers, args.controllers, FILTERS, draw):
+    under = (None,) if args.unfiltered else FILTERS
+    for flight in suite.fly_suite(maneuvers, args.controllers, under, draw):
         table.add(flight.row.cells())
     return 0
 
