@@ -182,7 +182,8 @@ def _short() -> TrainConfig:
         update={
             "preset": "short",
             "curriculum": fast.curriculum.model_copy(update={"phase1": phase1, "phase2": shorter}),
-            "refine": fast.refine.model_copy(update={"iterations": 100}),
+            # Its agent is slow when refinement begins: within 30 s, what does not arrive only saves effort.
+            "refine": fast.refine.model_copy(update={"iterations": 100, "horizon_seconds": 45.0, "effort_weight": 3.5}),
             "eval_every": 6_000,
             "eval_cases": 200,
             "refine_log_every": 10,
