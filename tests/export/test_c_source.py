@@ -94,6 +94,7 @@ def test_everything_compiles_without_a_warning(agent, folder, tmp_path, monkeypa
             run(compiler, *WARNINGS, *defined, "-c", where / name, "-o", tmp_path / "out.o")
 
 
+@pytest.mark.slow
 def test_nothing_is_left_to_be_filled_in(folder):
     for path in folder.iterdir():
         assert not re.findall(r"@[A-Z_]+@", path.read_text())

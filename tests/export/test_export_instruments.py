@@ -26,6 +26,9 @@ from koz_jax.task.any_spacecraft import constants
 from koz_jax.task.observation_layout import ABSENT_HALF_ANGLE, size, slices
 from koz_jax.task.state import torque_limits
 
+# The fixture compiles for long.
+pytestmark = pytest.mark.slow
+
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 
 ZONES = 4

@@ -125,6 +125,7 @@ def test_handlers_are_put_back():
     assert {number: signal.getsignal(number) for number in before} == before
 
 
+@pytest.mark.slow
 def test_resuming_a_finished_run_returns_its_agent_without_training(run, copied, no_compute):
     before = tiny.contents(copied.path)
     agent = train(CONFIG, copied.path, resume=True, progress=False)
