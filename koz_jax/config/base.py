@@ -1,9 +1,17 @@
 """What settings are made of: checked numbers, ramps, and the base class of all of them."""
 
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+)
 
 from koz_jax.errors import SettingsError, explain
 
@@ -19,6 +27,7 @@ Seed = Annotated[int, Field(ge=0, lt=2**32)]
 CaseCount = Annotated[int, Field(gt=0, lt=2**31)]
 CheckCount = Annotated[int, Field(gt=0, le=100)]
 Fraction = Annotated[float, Field(gt=0, le=1)]
+Share = Annotated[float, Field(ge=0, le=1)]
 ShareBelowOne = Annotated[float, Field(ge=0, lt=1)]
 HalfAngleDeg = Annotated[float, Field(gt=0, lt=180)]
 MarginDeg = Annotated[float, Field(gt=0, lt=180)]
@@ -33,6 +42,13 @@ def _check_ramp(ramp: tuple[tuple[float, float], ...]) -> tuple[tuple[float, flo
     if not ramp or fractions != sorted(set(fractions)) or fractions[0] < 0 or fractions[-1] > 1:
         raise ValueError("a ramp needs one or more (fraction, value) pairs with fractions rising strictly in [0, 1]")
     return ramp
+
+
+def check_unit(name: str, vector: Vector) -> None:
+    """Refuse a vector that is not of unit length."""
+    length = float(np.linalg.norm(vector))
+    if abs(length - 1.0) > 1e-6:
+        raise ValueError(f"{name} must be a unit vector; {vector} has length {length:.6g}")
 
 
 def check_steps(name: str, seconds: float, step_seconds: float) -> None:
@@ -60,6 +76,20 @@ class Settings(BaseModel):
     """Base of all settings: immutable, no unknown fields, no infinities."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+class SettingsOfAgents(Settings):
+    """Settings that shipped agents are hashed with.
+
+    ``later``: fields that came after them.  They are not written where they have their default, so that hashes stay.
+    """
+
+    later: ClassVar[tuple[str, ...]] = ()
+
+    @model_serializer(mode="wrap")
+    def _without_later_defaults(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        unset = {name for name in self.later if getattr(self, name) == type(self).model_fields[name].default}
+        return {name: value for name, value in serialize(self).items() if name not in unset}
 
 
 SettingsType = TypeVar("SettingsType", bound=Settings)

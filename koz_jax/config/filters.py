@@ -7,8 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import Discriminator, Tag, model_validator
 
 from koz_jax.config.base import NonNegativeFloat, PositiveFloat, PositiveInt, Seed, Settings, Vector
-from koz_jax.config.shield import ShieldConfig
-from koz_jax.errors import SettingsError
+from koz_jax.config.shield import ShieldConfig, check_cones, check_disturbance
 
 FilterName = Literal["shield", "zoh_cbf"]
 
@@ -43,12 +42,7 @@ class ZohCbfConfig(Settings):
             SettingsError: the disturbance is as strong.
 
         """
-        weakest = min(torque_limits)
-        if self.disturbance_torque >= weakest:
-            raise SettingsError(
-                f"disturbance_torque: must be below the torque limit of {weakest} N m for the filter to allow for it,"
-                f" got {self.disturbance_torque}"
-            )
+        check_disturbance(self.disturbance_torque, torque_limits, "the filter to allow for")
 
     def check_cones(self, rate_deg: float) -> None:
         """Refuse a maneuver whose cones turn faster than is allowed for.  rate_deg: [deg/s] of the fastest axis.
@@ -57,12 +51,7 @@ class ZohCbfConfig(Settings):
             SettingsError: they do.
 
         """
-        # With room for what float32 rounds.
-        if rate_deg > self.cone_rate_deg * (1.0 + 1e-5):
-            raise SettingsError(
-                f"zoh_cbf.cone_rate_deg: must be at least {rate_deg:.6g}, the rate of the maneuver's fastest cone, got"
-                f" {self.cone_rate_deg:g}"
-            )
+        check_cones(self.name, self.cone_rate_deg, rate_deg)
 
 
 def _kind(given: Any) -> FilterName:

@@ -11,6 +11,35 @@ from koz_jax.config.uncertainty import CERTAIN, UncertaintyConfig
 from koz_jax.errors import SettingsError
 
 
+def check_disturbance(disturbance: float, torque_limits: Vector, what_for: str) -> None:
+    """Refuse a disturbance [N m] that a spacecraft has no torque for.  torque_limits: [N m] about each body axis.
+
+    Raises:
+        SettingsError: the disturbance is as strong.
+
+    """
+    weakest = min(torque_limits)
+    if disturbance >= weakest:
+        raise SettingsError(
+            f"disturbance_torque: must be below the torque limit of {weakest} N m for {what_for} it, got {disturbance}"
+        )
+
+
+def check_cones(filter_name: str, allowed_deg: float, rate_deg: float) -> None:
+    """Refuse a maneuver whose fastest cone [deg/s] turns faster than a filter allows for [deg/s].
+
+    Raises:
+        SettingsError: it does.
+
+    """
+    # With room for what float32 rounds.
+    if rate_deg > allowed_deg * (1.0 + 1e-5):
+        raise SettingsError(
+            f"{filter_name}.cone_rate_deg: must be at least {rate_deg:.6g}, the rate of the maneuver's fastest cone,"
+            f" got {allowed_deg:g}"
+        )
+
+
 class ShieldConfig(Settings):
     """The shield."""
 
@@ -46,12 +75,7 @@ class ShieldConfig(Settings):
             SettingsError: the disturbance is as strong.
 
         """
-        disturbance, weakest = self.error_bounds.disturbance_torque, min(torque_limits)
-        if disturbance >= weakest:
-            raise SettingsError(
-                f"disturbance_torque: must be below the torque limit of {weakest} N m for the shield to withstand"
-                f" it, got {disturbance}"
-            )
+        check_disturbance(self.error_bounds.disturbance_torque, torque_limits, "the shield to withstand")
 
     def check_cones(self, rate_deg: float) -> None:
         """Refuse a maneuver whose cones turn faster than is withstood.  rate_deg: [deg/s] of the fastest axis.
@@ -60,9 +84,4 @@ class ShieldConfig(Settings):
             SettingsError: they do.
 
         """
-        # With room for what float32 rounds.
-        if rate_deg > self.cone_rate_deg * (1.0 + 1e-5):
-            raise SettingsError(
-                f"shield.cone_rate_deg: must be at least {rate_deg:.6g}, the rate of the maneuver's fastest cone, got"
-                f" {self.cone_rate_deg:g}"
-            )
+        check_cones(self.name, self.cone_rate_deg, rate_deg)

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import Field, model_validator
 
-from koz_jax.config.base import Fraction, PositiveFloat, Settings, ZoneCount
+from koz_jax.config.base import Fraction, PositiveFloat, SettingsOfAgents, Share, ZoneCount
 from koz_jax.config.uncertainty import CERTAIN, DelaySteps, UncertaintyConfig
 
-Share = Annotated[float, Field(ge=0, le=1)]
 Urgency = Share
 InstrumentCount = Annotated[int, Field(ge=1, le=3)]
 
 
-class SpreadConfig(Settings):
+class SpreadConfig(SettingsOfAgents):
     """What is drawn anew for every maneuver, besides its scenario."""
+
+    later: ClassVar = ("nominal",)
 
     spacecraft: bool = False
     """Fly another spacecraft in every maneuver: any shape, any instrument, torque limits that differ by up to a factor
@@ -62,12 +63,6 @@ class SpreadConfig(Settings):
             if limits is not None and limits[0] > limits[1]:
                 raise ValueError(f"{name} must be in order; got {limits}")
         return self
-
-    @model_serializer(mode="wrap")
-    def _without_what_is_not_there(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Hashes of agents from before there were nominal maneuvers stay as they are."""
-        written = serialize(self)
-        return written if self.nominal else {name: value for name, value in written.items() if name != "nominal"}
 
     @property
     def is_none(self) -> bool:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Discriminator, SerializerFunctionWrapHandler, Tag, model_serializer, model_validator
+from pydantic import Discriminator, Tag, model_validator
 
 from koz_jax.config.actuators import gyros, wheels
 from koz_jax.config.actuators.gyros import GyroConfig
@@ -16,9 +16,11 @@ from koz_jax.config.base import (
     PositiveFloat,
     PositiveVector,
     Settings,
+    SettingsOfAgents,
     Vector,
     ZoneCount,
     check_steps,
+    check_unit,
 )
 from koz_jax.config.spread import SpreadConfig
 from koz_jax.errors import SettingsError
@@ -34,8 +36,10 @@ TorqueLimit = Annotated[
 ]
 
 
-class SpacecraftConfig(Settings):
+class SpacecraftConfig(SettingsOfAgents):
     """The spacecraft (section 2.5 of the paper)."""
+
+    later: ClassVar = ("gyros",)
 
     inertia: tuple[Vector, Vector, Vector] = ((60.0, 5.0, 1.0), (5.0, 50.0, 2.0), (1.0, 2.0, 70.0))
     """Inertia tensor in body axes, row by row [kg m^2]."""
@@ -60,12 +64,6 @@ class SpacecraftConfig(Settings):
             return gyros.torque_box(self.gyros)
         limit = self.torque_limit
         return limit if isinstance(limit, tuple) else (limit, limit, limit)
-
-    @model_serializer(mode="wrap")
-    def _without_what_is_not_there(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Hashes of agents from before there were gyros stay as they are."""
-        written = serialize(self)
-        return written if self.gyros else {name: value for name, value in written.items() if name != "gyros"}
 
     @property
     def time_unit(self) -> float:
@@ -96,9 +94,7 @@ class SpacecraftConfig(Settings):
                 "inertia must obey the triangle inequality (no principal moment above the sum of the other two);"
                 f" its principal moments are {principal.tolist()}"
             )
-        length = float(np.linalg.norm(self.boresight))
-        if abs(length - 1.0) > 1e-6:
-            raise ValueError(f"boresight must be a unit vector; {self.boresight} has length {length:.6g}")
+        check_unit("boresight", self.boresight)
         return self
 
 

@@ -93,8 +93,8 @@ class Reorientation(struct.PyTreeNode):
         found = spread.draw(self.spread, self.model, self.ranges, key)
         uncertainty = self.uncertainty
         if uncertainty is not None:
-            delay = uncertainty.delay if found.delay is None else found.delay
-            uncertainty = uncertainty.without_errors(found.nominal).replace(delay=delay)
+            late = uncertainty if found.delay is None else uncertainty.replace(delay=found.delay)
+            uncertainty = late.without_errors(found.nominal)
         return self.replace(
             model=found.model, ranges=found.ranges, urgency=found.urgency, uncertainty=uncertainty, spread=None
         )

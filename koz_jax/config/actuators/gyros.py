@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from koz_jax.config.base import PositiveFloat, Settings, Vector
+from koz_jax.config.base import PositiveFloat, Settings, Vector, check_unit
 
 # Of the torque about all axes at once that there is with all gimbals at zero, what controllers are told of.
 BOX_SHARE = 0.5
@@ -36,10 +36,8 @@ class GyroConfig(Settings):
 
     @model_validator(mode="after")
     def _possible(self) -> GyroConfig:
-        for name in ("gimbal_axis", "rotor_axis"):
-            length = float(np.linalg.norm(getattr(self, name)))
-            if abs(length - 1.0) > 1e-6:
-                raise ValueError(f"{name} must be a unit vector; {getattr(self, name)} has length {length:.6g}")
+        check_unit("gimbal_axis", self.gimbal_axis)
+        check_unit("rotor_axis", self.rotor_axis)
         along = float(np.dot(self.gimbal_axis, self.rotor_axis))
         if abs(along) > 1e-6:
             raise ValueError(f"rotor_axis must be square to gimbal_axis; got {self.rotor_axis}, {along:.6g} along it")

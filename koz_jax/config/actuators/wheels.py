@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import model_validator
 
-from koz_jax.config.base import PositiveFloat, Settings, Vector
+from koz_jax.config.base import PositiveFloat, Settings, Vector, check_unit
 
 # Axes that span space only by less than this are a slip of the pen.
 _LEAST_SPAN = 1e-3
@@ -30,9 +30,7 @@ class WheelConfig(Settings):
 
     @model_validator(mode="after")
     def _possible(self) -> WheelConfig:
-        length = float(np.linalg.norm(self.axis))
-        if abs(length - 1.0) > 1e-6:
-            raise ValueError(f"axis must be a unit vector; {self.axis} has length {length:.6g}")
+        check_unit("axis", self.axis)
         if abs(self.momentum) > self.max_momentum:
             raise ValueError(
                 f"momentum must be at most max_momentum = {self.max_momentum:g} in size; got {self.momentum:g}"

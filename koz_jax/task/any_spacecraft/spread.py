@@ -87,7 +87,6 @@ def draw(spread: Spread, model: Model, ranges: ScenarioRanges, key: jax.Array) -
     if spread.late:
         shortest, longest = spread.delays
         delay = jax.random.randint(jax.random.fold_in(key, _DELAY), (), shortest, longest + 1)
-        delay = jnp.where(nominal, 0, delay)
     if spread.spacecraft:
         model = _sample_body(spread, model, key_body)
         boresight_B = rotations.normalize(jax.random.normal(key_boresight, (3,)))
