@@ -2,7 +2,7 @@
 
     python benchmarks/yang2021.py [--markdown FILE]
 
-Energies are over 150 s, as published.  1000 N m are no limit: none of the flights asks for so much.
+Energies are over 150 s, as published.  1000 N m stand for no limit.
 """
 
 import argparse
