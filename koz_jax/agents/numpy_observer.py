@@ -22,6 +22,7 @@ from koz_jax.config.task import SpacecraftConfig
 from koz_jax.errors import SettingsError
 from koz_jax.task import host
 from koz_jax.task.any_spacecraft import constants
+from koz_jax.task.any_spacecraft.host_wheels import HostWheels
 from koz_jax.task.host import Cones
 from koz_jax.task.observation_layout import ABSENT_HALF_ANGLE, ACTION_SIZE, layout, zone_part
 
@@ -95,7 +96,11 @@ class Observer:
 class ScaledObserver(Observer):
     """What a policy for any spacecraft sees of one, in its units and axes, and the torque that its actions ask for.
 
-    Where zones are of several instruments, the axes are those of the nearest zone's.
+    Where zones are of several instruments, the axes are those of the nearest zone's.  What reaction wheels leave of the
+    torque depends on their momentum, which is told with every observation:
+
+    >>> torque_B = observer.torque(policy.predict(observer.observe(q_BN, omega_BN_B, q_DN, zones, wheel_momentum)))
+    >>> each = observer.wheel_torques(torque_B)
     """
 
     def __init__(
@@ -104,13 +109,13 @@ class ScaledObserver(Observer):
         """Begin a maneuver.
 
         Args:
-            spacecraft: what turns, and its instrument.
+            spacecraft: what turns, its instrument, and its wheels where it has any.
             step_seconds: time step, over which the torque is held [s].
             urgency: from 0 (thrifty) to 1 (as fast as the torque allows); see ``set_urgency``.
             observed_zones: how many zones the policy sees.
 
         Raises:
-            SettingsError: the time step is not above 0, or the urgency not in [0, 1].
+            SettingsError: the time step is not above 0, the urgency not in [0, 1], or the spacecraft has gyros.
 
         """
         super().__init__(spacecraft.boresight, observed_zones)
@@ -120,6 +125,33 @@ class ScaledObserver(Observer):
         self._spacecraft, self._step_seconds = spacecraft, step_seconds
         self._own = constants.of(spacecraft, step_seconds)
         self._seen = self._own
+        self._wheels = HostWheels(spacecraft) if spacecraft.wheels else None
+        self._momentum = self._wheels.momentum_at_start if self._wheels else np.zeros(0)
+        self._omega_BN_B = np.zeros(3)
+
+    def observe(
+        self,
+        q_BN: npt.ArrayLike,
+        omega_BN_B: npt.ArrayLike,
+        q_DN: npt.ArrayLike,
+        zones: Sequence[Any] = (),
+        wheel_momentum: npt.ArrayLike | None = None,
+    ) -> npt.NDArray[np.float32]:
+        """See what is measured in this time step; as of ``Observer.observe``.
+
+        wheel_momentum: of each wheel about its axis (wheels,) [N m s]; None is that at the start, as the spacecraft's
+        settings say.  Returns (entries,), in the order of ``layout(zones, scaled=True)``.
+
+        Raises:
+            SettingsError: likewise, or momenta are told and there are no wheels.
+
+        """
+        if self._wheels:
+            told = self._wheels.momentum_at_start if wheel_momentum is None else wheel_momentum
+            self._momentum = host.numbers("wheel_momentum", told, self._wheels.momentum_at_start.shape)
+        elif wheel_momentum is not None:
+            raise SettingsError("wheel_momentum: must be None, for the spacecraft has no wheels")
+        return super().observe(q_BN, omega_BN_B, q_DN, zones)
 
     def set_urgency(self, urgency: float) -> None:
         """Hurry more or less from the next step on.
@@ -137,27 +169,53 @@ class ScaledObserver(Observer):
     def torque(self, action: npt.ArrayLike) -> npt.NDArray[np.float32]:
         """Torque that an action asks for in the situation that was observed last.
 
-        action: (3,) in [-1, 1].  Returns (3,) [N m] in body axes, within the torque limits.
+        action: (3,) in [-1, 1].  Returns (3,) [N m] in body axes, within the limits, or what wheels leave of them.
 
         Raises:
             SettingsError: the action is not finite or has another shape.
 
         """
         asked_B = self._seen.torque_per_action @ host.numbers("action", action, (ACTION_SIZE,))
-        return np.clip(asked_B, -self._seen.torque_limits, self._seen.torque_limits).astype(np.float32)
+        limits_B = self._share() * self._seen.torque_limits
+        return np.clip(asked_B, -limits_B, limits_B).astype(np.float32)
+
+    def wheel_torques(self, torque_B: npt.ArrayLike) -> npt.NDArray[np.float32]:
+        """What each wheel has to do for a torque, in the situation that was observed last.
+
+        torque_B: (3,) [N m] in body axes, clipped to what the wheels leave.  Returns the torque (wheels,) [N m] that
+        each gives the body over the time step, by which its own momentum falls; less of all where one of them is at the
+        end of its torque or of its momentum.
+
+        Raises:
+            SettingsError: the torque is not finite or has another shape, or the spacecraft has no wheels.
+
+        """
+        if self._wheels is None:
+            raise SettingsError("wheel_torques: the spacecraft has no wheels")
+        wanted_B = host.numbers("torque_B", torque_B, (3,))
+        each = self._wheels.torques(wanted_B, self._momentum, self._omega_BN_B, self._step_seconds)
+        return each.astype(np.float32)
+
+    def _share(self) -> float:
+        """Of the torque limits, what is left now."""
+        return self._wheels.share(self._momentum, self._omega_BN_B) if self._wheels else 1.0
 
     def _pack(
         self, q_BN: host.Floats, omega_BN_B: host.Floats, q_e: host.Floats, q_e0_previous: float, nearest: Cones
     ) -> npt.NDArray[np.float32]:
         same = np.array_equal(nearest.boresight_B[0], self._boresight_B)
         self._seen = self._own if same else constants.of(self._spacecraft, self._step_seconds, nearest.boresight_B[0])
-        axes = self._seen.axes
+        axes, self._omega_BN_B = self._seen.axes, omega_BN_B
         parts: dict[str, Any] = {
             "q_e": [q_e[0], *(axes @ q_e[1:])],
             "omega_BN_P": self._seen.time * (axes @ omega_BN_B),
             **self._seen.seen,
             "urgency": [2.0 * self._urgency - 1.0],
         }
+        if self._wheels:
+            largest = self._wheels.largest_rate(self._momentum, omega_BN_B)
+            parts["reach"] = self._share() * self._seen.seen["reach"]
+            parts["rate_limit"] = constants.seen_rate(largest, self._seen.time)
         for number in range(self._observed_zones):
             zone = Cones(*(leaf[number] for leaf in nearest))
             seen = _zone_parts(q_BN, zone, masked=True)

@@ -11,7 +11,9 @@ from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.spread import SpreadConfig
 from koz_jax.config.task import TaskConfig
 from koz_jax.errors import SettingsError
-from koz_jax.export.c import C_FILES, SHIELD_FILES, c_files, shield_files
+from koz_jax.export.c_source.policy import C_FILES, c_files
+from koz_jax.export.c_source.shield import SHIELD_FILES, shield_files
+from koz_jax.export.c_source.wheels import WHEEL_FILES
 from koz_jax.export.golden import example, golden
 from koz_jax.export.metadata import describe
 from koz_jax.export.shield_golden import shield_golden
@@ -41,7 +43,8 @@ def export(
     Raises:
         MissingExtraError: a package that the format needs is not installed.
         SettingsError: the shield cannot be, or the agent is of one spacecraft and is asked to fly another, or with
-            several instruments; or these are no unit vectors, or the format is not C.
+            several instruments; or these are no unit vectors, or the format is not C; or the format does not know the
+            spacecraft's actuators.
 
     """
     made = made_for(agent, task)
@@ -57,6 +60,8 @@ def export(
         from koz_jax.export.stablehlo import stablehlo_files
 
         return stablehlo_files(agent, metadata)
+    if shield is not None and made.task.spacecraft.wheels:
+        raise SettingsError("shield: is not exported for a spacecraft with wheels yet; leave it out")
     vectors = golden(made, GOLDEN_VECTORS, further_boresights=further)
     contents = c_files(policy, metadata, vectors, example(made, bool(further)))
     if shield is None:
@@ -105,8 +110,8 @@ def write_files(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:
         StorageError: a file cannot be written.
 
     """
-    # The shield of another controller would be compiled in.
-    superseded = {*SHIELD_FILES} - {*contents} if {*C_FILES} <= {*contents} else set()
+    # The shield of another controller would be compiled in, its wheels be taken for this one's.
+    superseded = {*SHIELD_FILES, *WHEEL_FILES} - {*contents} if {*C_FILES} <= {*contents} else set()
     for name in (*contents, *superseded):
         if (folder / name).exists() and b"koz_jax" not in (folder / name).read_bytes():
             raise SettingsError(f"out: {folder / name} was not written by an export; choose another folder")

@@ -41,27 +41,31 @@ class CLibrary:
                 raise SettingsError(f"compiler: {compiler!r} refuses {source}: {done.stderr.strip()}")
             self._functions = ctypes.CDLL(str(library))
         header = (Path(folder) / "koz_policy.h").read_text(encoding="utf-8")
-        self.zones, self._observation_size = (
-            int(re.findall(rf"#define {name} (\d+)", header)[0]) for name in ("KOZ_ZONES", "KOZ_OBSERVATION_SIZE")
-        )
+        names = ("KOZ_ZONES", "KOZ_OBSERVATION_SIZE", "KOZ_WHEELS")
+        self.zones, self._observation_size, self.wheels = (_defined(name, header) for name in names)
         self._several = "#define KOZ_INSTRUMENTS" in header
-        self._situation_size = 11 + (5 if self._several else 4) * self.zones
-        # q_e, an urgency where the policy sees one, and which instrument where there are several.
-        self._memory_size = 4 + ("#define KOZ_URGENCY" in header) + self._several
-        for name, pointers in (("start", 2), ("observe", 3), ("decide", 2), ("torque", 3 if self._several else 2)):
-            getattr(self._functions, f"koz_{name}").argtypes = (ctypes.c_void_p,) * pointers
-            getattr(self._functions, f"koz_{name}").restype = None
-        self._functions.koz_fault.argtypes = (ctypes.c_void_p,)
-        self._functions.koz_fault.restype = ctypes.c_char_p
+        self._situation_size = 11 + (5 if self._several else 4) * self.zones + self.wheels
+        # q_e, an urgency where the policy sees one, what wheels leave, and which instrument where there are several.
+        self._memory_size = 4 + ("#define KOZ_URGENCY" in header) + 3 * bool(self.wheels) + self._several
+        self._remembers = self._several or self.wheels > 0
         self.has_shield = shield.is_file()
-        if self.has_shield:
-            self._functions.koz_shield.argtypes = (ctypes.c_void_p,) * 3
-            self._functions.koz_shield.restype = None
+        self._declare()
+
+    def _declare(self) -> None:
+        """Tell ctypes what the functions take; all but one return nothing."""
+        pointers = {"start": 2, "observe": 3, "decide": 2, "torque": 3 if self._remembers else 2, "fault": 1}
+        pointers |= {"shield": 3} if self.has_shield else {}
+        pointers |= {"wheel_torques": 3} if self.wheels else {}
+        for name, count in pointers.items():
+            function = getattr(self._functions, f"koz_{name}")
+            function.argtypes, function.restype = (ctypes.c_void_p,) * count, None
+        self._functions.koz_fault.restype = ctypes.c_char_p
 
     def faults(self, situations: np.ndarray) -> list[str | None]:
         """What is wrong with each situation (batch, 11 + 4 zones): ``koz_situation`` field by field; None: nothing.
 
-        Of several instruments (batch, 11 + 5 zones), here and below: the number of each zone's comes last.
+        Here and below, the momentum of each wheel comes next where there are wheels, and the number of each zone's
+        instrument last where there are several.
         """
         told = self._situations(situations)
         found = [self._functions.koz_fault(row.ctypes.data) for row in told]
@@ -70,8 +74,9 @@ class CLibrary:
     def start(self, situations: np.ndarray) -> np.ndarray:
         """Begin maneuvers in these situations (batch, 11 + 4 zones).
 
-        Returns memories (batch, 4) for ``observe``; of a policy for any spacecraft (batch, 5), the last its urgency; of
-        several instruments (batch, 6), the last the number of the nearest zone's.
+        Returns memories for ``observe``, ``koz_memory`` field by field: (batch, 4); then the urgency of a policy for
+        any spacecraft, three torque limits [N m] where there are wheels, and the number of the nearest zone's
+        instrument where there are several.
         """
         told = self._situations(situations)
         memories = np.empty((len(told), self._memory_size), np.float32)
@@ -97,19 +102,32 @@ class CLibrary:
     def torque(self, observations: np.ndarray, memories: np.ndarray | None = None) -> np.ndarray:
         """Torques (batch, 3) [N m] in body axes for observations (batch, entries).
 
-        memories: of several instruments, as ``observe`` returned them with the observations.
+        memories: of wheels or several instruments, as ``observe`` returned them with the observations.
 
         Raises:
-            SettingsError: there are several instruments and no memories, or an input has another shape.
+            SettingsError: there are wheels or several instruments and no memories, or an input has another shape.
 
         """
-        if not self._several:
+        if not self._remembers:
             return self._answer("koz_torque", observations)
         if memories is None:
-            raise SettingsError("memories: must be those of the observations where there are several instruments")
+            raise SettingsError(
+                "memories: must be those of the observations where there are wheels or several instruments, got None"
+            )
         kept = self._memories(memories)
         _check_as_many("memories", kept, observations, "observations")
         return self._answer("koz_torque", observations, kept)
+
+    def wheel_torques(self, situations: np.ndarray, torques: np.ndarray) -> np.ndarray:
+        """Torques (batch, wheels) [N m] that each wheel gives the body where torques (batch, 3) [N m] are to turn it.
+
+        Raises:
+            SettingsError: it was exported for a spacecraft without wheels, or an input has another shape.
+
+        """
+        if not self.wheels:
+            raise SettingsError("wheel_torques: this controller is of a spacecraft without wheels")
+        return self._answer_torques("koz_wheel_torques", situations, torques, self.wheels)
 
     def shield(self, situations: np.ndarray, torques: np.ndarray) -> np.ndarray:
         """Torques (batch, 3) [N m] that the shield allows in place of the requested ones.
@@ -120,12 +138,14 @@ class CLibrary:
         """
         if not self.has_shield:
             raise SettingsError("shield: this controller was exported without; --shield exports it")
-        told = self._situations(situations)
-        requested = _rows_of("torques", torques, ACTION_SIZE)
+        return self._answer_torques("koz_shield", situations, torques, ACTION_SIZE)
+
+    def _answer_torques(self, name: str, situations: np.ndarray, torques: np.ndarray, entries: int) -> np.ndarray:
+        told, requested = self._situations(situations), _rows_of("torques", torques, ACTION_SIZE)
         _check_as_many("torques", requested, told)
-        allowed = np.empty_like(requested)
-        self._each("koz_shield", told, requested, allowed)
-        return allowed
+        answers = np.empty((len(told), entries), np.float32)
+        self._each(name, told, requested, answers)
+        return answers
 
     def _answer(self, name: str, observations: np.ndarray, *before: np.ndarray) -> np.ndarray:
         asked = _rows_of("observations", observations, self._observation_size)
@@ -152,6 +172,11 @@ class CLibrary:
         places = [(table.ctypes.data, table.strides[0]) for table in tables]
         for index in range(len(tables[0])):
             function(*(start + index * stride for start, stride in places))
+
+
+def _defined(name: str, header: str) -> int:
+    """The number that a header defines by a name; 0 where it does not."""
+    return sum(map(int, re.findall(rf"#define {name} (\d+)", header)))
 
 
 def _rows_of(name: str, given: np.ndarray, entries: int, integers: int = 0) -> np.ndarray:

@@ -12,6 +12,7 @@ from koz_jax.config.task import ScenarioConfig, TaskConfig
 from koz_jax.config.training import NetworkConfig
 from koz_jax.config.version import version
 from koz_jax.errors import SettingsError
+from koz_jax.export import wheels_text
 from koz_jax.task.any_spacecraft import constants
 from koz_jax.task.observation_layout import layout, meaning, slices
 
@@ -44,7 +45,8 @@ class Scaling(Settings):
     axes: tuple[Vector, Vector, Vector]
     """The policy's axes, rows in body components: v_P = axes v_B."""
     seen: dict[str, tuple[float, ...]]
-    """Parts of the observation that are the same all the time."""
+    """Parts of the observation that are the same all the time; but reach and rate_limit of a spacecraft with wheels,
+    which are those of the start, at rest."""
     torque_per_action: tuple[Vector, Vector, Vector]
     """[N m] Takes an action to a torque in body axes."""
     urgency: float
@@ -76,6 +78,8 @@ class Metadata(Settings):
     provenance: Provenance
     scaling: Scaling | None = None
     """Of a policy for any spacecraft."""
+    wheels: str = ""
+    """What depends on the momentum of reaction wheels; empty where there are none."""
     further_instruments: tuple[Instrument, ...] = ()
     """Those whose zones are told by the numbers 1, 2, ...; number 0 is ``boresight_B``, with ``scaling``."""
 
@@ -86,7 +90,7 @@ class Metadata(Settings):
 
     def to_json(self, indent: int | None = None) -> str:
         """What exported files hold."""
-        unused = {name for name in ("scaling", "further_instruments") if not getattr(self, name)}
+        unused = {name for name in ("scaling", "wheels", "further_instruments") if not getattr(self, name)}
         return self.model_dump_json(indent=indent, exclude=unused)
 
 
@@ -105,7 +109,7 @@ def describe(
         further_boresights: unit vectors (3,) in body axes, of the spacecraft's instruments after the first.
 
     Raises:
-        SettingsError: the spacecraft has wheels, or several instruments and the policy is not for any spacecraft.
+        SettingsError: the spacecraft has gyros, or several instruments and the policy is not for any spacecraft.
 
     """
     record = policy.record
@@ -131,6 +135,7 @@ def describe(
         task=task,
         provenance=record.provenance,
         scaling=_scaling(task, urgency, task.spacecraft.boresight) if scaled else None,
+        wheels=wheels_text.meaning_of(task.spacecraft.wheels, scaled),
         further_instruments=tuple(
             Instrument(boresight_B=boresight, scaling=_scaling(task, urgency, boresight))
             for boresight in further_boresights
@@ -141,9 +146,7 @@ def describe(
 def _check(name: str, scaled: bool, task: TaskConfig, further: int) -> None:
     """Refuse what exports do not know."""
     if task.spacecraft.gyros:
-        raise SettingsError("spacecraft.gyros: are not exported yet; allowed is torque_limit")
-    if task.spacecraft.wheels:
-        raise SettingsError("spacecraft.wheels: are not exported yet; allowed is torque_limit")
+        raise SettingsError("spacecraft.gyros: are not exported yet; allowed are torque_limit and wheels")
     if further and not scaled:
         raise SettingsError(
             f"further_boresights: must be none for {name}, which was trained for one spacecraft with one instrument,"
@@ -194,6 +197,7 @@ def as_text(metadata: Metadata) -> str:
         *(_entry_text(entry) for entry in metadata.observation),
         f"Action: {metadata.action}.",
         *(_scaling_text(metadata.scaling) if metadata.scaling else ()),
+        *([metadata.wheels] if metadata.wheels else []),
         *_instruments_text(metadata.further_instruments),
         f"Limits: torque {_torque(metadata.torque_limit)}; time step {metadata.step_seconds:g} s;"
         f" boresight {list(metadata.boresight_B)} in body axes; inertia {[list(r) for r in task.spacecraft.inertia]}"

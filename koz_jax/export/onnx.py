@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from koz_jax.agents.numpy_policy import NumpyPolicy
-from koz_jax.errors import missing_extra
+from koz_jax.errors import SettingsError, missing_extra
 from koz_jax.export.metadata import Metadata
 from koz_jax.sac.dials import DIAL_FEATURES, spacing
 from koz_jax.task.observation_layout import ACTION_SIZE
@@ -113,12 +113,35 @@ def _dial_features(graph: _Graph, policy: NumpyPolicy, axis: str) -> list[str]:
 
 
 def _torque(graph: _Graph, action: str, metadata: Metadata) -> None:
-    """The torque that an action asks for, by the name ``torque_B``."""
+    """The torque that an action asks for, by the name ``torque_B``.
+
+    Raises:
+        SettingsError: the spacecraft has wheels, and the policy does not see what they leave of the torque.
+
+    """
     limit = graph.constant("torque_limit", np.asarray(metadata.torque_limit, np.float32))
     if metadata.scaling is None:
+        if metadata.wheels:
+            raise SettingsError(
+                f"spacecraft.wheels: must be none for {metadata.name} to onnx, for what they leave of the torque is not"
+                " in its observation; allowed are --to c and --to stablehlo"
+            )
         graph.node("Mul", [action, limit], "torque_B")
         return
     per_action = graph.constant("torque_per_action", np.array(metadata.scaling.torque_per_action, np.float32).T)
     asked = graph.node("MatMul", [action, per_action], "asked_B")
+    if metadata.wheels:
+        limit = _left(graph, limit, metadata)
     below = graph.node("Min", [asked, limit], "below_B")
     graph.node("Max", [below, graph.node("Neg", [limit], "negative_limit")], "torque_B")
+
+
+def _left(graph: _Graph, limit: str, metadata: Metadata) -> str:
+    """What wheels leave of the limit: by the same share, they leave less of what the policy sees of its reach."""
+    assert metadata.scaling is not None
+    (start,) = (entry.start for entry in metadata.observation if entry.name == "reach")
+    bounds = [graph.constant(f"reach_{at}", np.array([at], np.int64)) for at in (start, start + 1)]
+    reach = graph.node("Slice", ["observation", *bounds, "axis"], "reach")
+    at_rest = graph.constant("reach_at_rest", np.float32(metadata.scaling.seen["reach"][0]))
+    share = graph.node("Div", [reach, at_rest], "share")
+    return graph.node("Mul", [share, limit], "limit_left")

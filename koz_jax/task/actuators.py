@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from koz_jax.config.actuators import wheels
+from koz_jax.config.actuators.wheels import BRAKE_SHARE, LEAST_SHARE
 from koz_jax.config.task import SpacecraftConfig
 from koz_jax.task import dynamics, rotations
 from koz_jax.task.gyros import gimbals
@@ -20,14 +21,8 @@ from koz_jax.task.gyros.gimbals import Gimbals
 
 ActuatorState = Any  # a pytree of fixed shapes; None where actuators have no state
 
-# Of wheels' torque, what braking counts on at any rate; the rest is for the gyroscopic torque of their momentum.
-BRAKE_SHARE = 0.5
-
 # Of a rotor's momentum, what all gyros together may hold for ``largest_rate``.
 ROTORS_USED = 1.0
-
-# Of wheels' torque, what controllers are told of at least, also where they are told of more than there is.
-LEAST_SHARE = 0.05
 
 
 class TorqueLimits(struct.PyTreeNode):
@@ -150,11 +145,17 @@ class ReactionWheels(struct.PyTreeNode):
     ) -> tuple[jax.Array, jax.Array]:
         """Share the torque out.  Returns the torque (3,) [N m], and the momentum of each wheel (wheels,) after it."""
         wanted_B = self.limits(state, omega_BN_B).box_B * jnp.clip(command, -1.0, 1.0)
+        each = self.torques(wanted_B, state, omega_BN_B, inertia_B, dt)
+        return self.axes_B.T @ each, state - dt * each
+
+    def torques(
+        self, wanted_B: jax.Array, state: jax.Array, omega_BN_B: jax.Array, inertia_B: jax.Array, dt: jax.Array
+    ) -> jax.Array:
+        """Torque that each wheel gives the body.  wanted_B: (3,) [N m] within the limits.  Returns (wheels,) [N m]."""
         each = self.allocation @ _with_gyroscopic(wanted_B, self.stored_momentum(state), omega_BN_B, inertia_B, dt)
         size = jnp.maximum(jnp.abs(each), 1e-12 * self.max_torque)
         room = jnp.minimum(self.max_torque, (self.max_momentum + jnp.sign(each) * state) / dt)
-        each = jnp.clip(jnp.min(room / size), 0.0, 1.0) * each
-        return self.axes_B.T @ each, state - dt * each
+        return jnp.clip(jnp.min(room / size), 0.0, 1.0) * each
 
     def stored_momentum(self, state: jax.Array) -> jax.Array:
         """Sum over the wheels.  Returns (3,) [N m s]."""

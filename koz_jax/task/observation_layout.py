@@ -46,6 +46,9 @@ SHORTEST_STEP = 0.01
 # [1/T] A limit of the rate above this is none.
 FREE_RATE = 3.0
 
+# Of that rate, what a policy tells apart from no rate at all.
+LEAST_RATE = 1e-3
+
 # [u / J] An action of one of a policy for any spacecraft asks for this acceleration; the torque box then limits it.
 FULL_ACTION = 2.0
 

@@ -144,13 +144,6 @@ def test_what_is_out_of_range_is_refused_by_name(urgency):
         observer.torque([0.0, 0.0, np.nan])
 
 
-def test_wheels_are_refused_by_name():
-    """Their torque and their largest rate depend on what they hold, which is not told."""
-    leo = koz_jax.load_maneuver(tiny.ROOT / "examples" / "leo_6u.toml").task
-    with pytest.raises(SettingsError, match=r"spacecraft.wheels: are flown by jax only"):
-        ScaledObserver(leo.spacecraft, leo.step_seconds)
-
-
 def test_a_missing_or_foreign_gain_is_refused(tmp_path):
     AGENT.save(tmp_path / "agent")
     policy = load_policy(tmp_path / "agent")

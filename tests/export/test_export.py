@@ -18,8 +18,8 @@ from koz_jax.config.training import NO_ENCODING
 from koz_jax.errors import SettingsError
 from koz_jax.evaluation import cases
 from koz_jax.evaluation.rollout import CaseResult
-from koz_jax.export.c import C_FILES
-from koz_jax.export.c_text import number
+from koz_jax.export.c_source.literals import number
+from koz_jax.export.c_source.policy import C_FILES
 from koz_jax.export.files import export, write_files
 from koz_jax.export.golden import Golden, golden
 from koz_jax.export.library import STRICT, CLibrary

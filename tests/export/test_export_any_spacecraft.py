@@ -243,9 +243,9 @@ def test_the_command_line(tmp_path, capsys):
     assert not (tmp_path / "other").exists()
     assert tiny.status("export", "phase2", *out, "--spacecraft", file) == 2
     assert "error: spacecraft: phase2 was trained for one spacecraft" in capsys.readouterr().err
-    wheels = tiny.ROOT / "examples" / "leo_6u.toml"
-    assert tiny.status("export", tmp_path / "agent", *out, "--spacecraft", wheels) == 2
-    assert "error: spacecraft.wheels: are not exported yet" in capsys.readouterr().err
+    gyros = tiny.ROOT / "examples" / "cmg_smallsat.toml"
+    assert tiny.status("export", tmp_path / "agent", *out, "--spacecraft", gyros) == 2
+    assert "error: spacecraft.gyros: are not exported yet" in capsys.readouterr().err
     assert tiny.status("export", tmp_path / "agent", *out, "--spacecraft", tmp_path / "none.toml") == 2
     assert "none.toml cannot be read" in capsys.readouterr().err
 

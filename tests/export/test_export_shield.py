@@ -25,7 +25,7 @@ from koz_jax.control.shield.filter import Shield
 from koz_jax.errors import SettingsError
 from koz_jax.evaluation import cases, monte_carlo, rollout
 from koz_jax.evaluation.rollout import CaseResult
-from koz_jax.export.c import SHIELD_FILES
+from koz_jax.export.c_source.shield import SHIELD_FILES
 from koz_jax.export.files import export, write_files
 from koz_jax.export.golden import Situation, rows
 from koz_jax.export.library import CLibrary

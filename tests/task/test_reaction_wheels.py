@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from support import oracle
 
-from koz_jax.config.actuators.wheels import WheelConfig
+from koz_jax.config.actuators.wheels import BRAKE_SHARE, WheelConfig
 from koz_jax.config.task import SpacecraftConfig, TaskConfig
 from koz_jax.task import dynamics
-from koz_jax.task.actuators import BRAKE_SHARE, ReactionWheels, from_config
+from koz_jax.task.actuators import ReactionWheels, from_config
 from koz_jax.task.environment import Reorientation, model_from_config
 from koz_jax.task.state import EnvState, Model, largest_rate
 

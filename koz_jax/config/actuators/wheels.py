@@ -15,6 +15,12 @@ from koz_jax.config.base import PositiveFloat, Settings, Vector, check_unit
 # Axes that span space only by less than this are a slip of the pen.
 _LEAST_SPAN = 1e-3
 
+# Of wheels' torque, what braking counts on at any rate; the rest is for the gyroscopic torque of their momentum.
+BRAKE_SHARE = 0.5
+
+# Of wheels' torque, what controllers are told of at least, also where they are told of more than there is.
+LEAST_SHARE = 0.05
+
 
 class WheelConfig(Settings):
     """A reaction wheel."""

@@ -22,10 +22,13 @@ static const double degrees = 57.29577951308232;
 static const double boresight_B@OF_INSTRUMENTS@[3] = {@EXACT_BORESIGHT@};
 static const double inertia[3][3] = {@EXACT_INERTIA@}; /* [kg m^2] */
 static const double inverse_inertia[3][3] = {@EXACT_INVERSE_INERTIA@};
+@WHEELS@static const double wheel_axis_B[KOZ_WHEELS][3] = {@EXACT_WHEEL_AXES@};
+@WHEELS@static const double wheel_max_momentum[KOZ_WHEELS] = {@EXACT_MAX_MOMENTUM@}; /* [N m s] */
 
 typedef struct {
     double q_BN[4];
     double omega_BN_B[3];
+@WHEELS@    double wheel_momentum[KOZ_WHEELS]; /* [N m s] */
 } rigid_body;
 
 static void cross(const double a[3], const double b[3], double c[3])
@@ -40,16 +43,34 @@ static double dot(const double a[3], const double b[3])
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
+@WHEELS@/* Angular momentum of the body and its wheels [N m s] in body axes. */
+@WHEELS@static void total_momentum(const rigid_body *at, double momentum_B[3])
+@WHEELS@{
+@WHEELS@    int i, wheel;
+@WHEELS@    for (i = 0; i < 3; i++) {
+@WHEELS@        momentum_B[i] = dot(inertia[i], at->omega_BN_B);
+@WHEELS@        for (wheel = 0; wheel < KOZ_WHEELS; wheel++)
+@WHEELS@            momentum_B[i] += wheel_axis_B[wheel][i] * at->wheel_momentum[wheel];
+@WHEELS@    }
+@WHEELS@}
+@WHEELS@
 /* Euler's equation and kinematics. */
-static void derivative(const rigid_body *at, const float torque_B[3], rigid_body *slope)
+@NO_WHEELS@static void derivative(const rigid_body *at, const float torque_B[3], rigid_body *slope)
+@WHEELS@static void derivative(const rigid_body *at, const float wheel_torque[KOZ_WHEELS], rigid_body *slope)
 {
     const double *q = at->q_BN, *w = at->omega_BN_B;
     double momentum_B[3], net_B[3], turned[3];
-    int i;
-    for (i = 0; i < 3; i++) momentum_B[i] = dot(inertia[i], w);
+@NO_WHEELS@    int i;
+@NO_WHEELS@    for (i = 0; i < 3; i++) momentum_B[i] = dot(inertia[i], w);
+@WHEELS@    int i, wheel;
+@WHEELS@    total_momentum(at, momentum_B);
     cross(momentum_B, w, net_B);
     cross(q + 1, w, turned);
-    for (i = 0; i < 3; i++) net_B[i] += (double)torque_B[i];
+@NO_WHEELS@    for (i = 0; i < 3; i++) net_B[i] += (double)torque_B[i];
+@WHEELS@    for (wheel = 0; wheel < KOZ_WHEELS; wheel++) {
+@WHEELS@        for (i = 0; i < 3; i++) net_B[i] += wheel_axis_B[wheel][i] * (double)wheel_torque[wheel];
+@WHEELS@        slope->wheel_momentum[wheel] = -(double)wheel_torque[wheel];
+@WHEELS@    }
     slope->q_BN[0] = -0.5 * dot(q + 1, w);
     for (i = 0; i < 3; i++) slope->q_BN[1 + i] = 0.5 * (q[0] * w[i] + turned[i]);
     for (i = 0; i < 3; i++) slope->omega_BN_B[i] = dot(inverse_inertia[i], net_B);
@@ -60,25 +81,38 @@ static void ahead(const rigid_body *from, const rigid_body *slope, double h, rig
     int i;
     for (i = 0; i < 4; i++) to->q_BN[i] = from->q_BN[i] + h * slope->q_BN[i];
     for (i = 0; i < 3; i++) to->omega_BN_B[i] = from->omega_BN_B[i] + h * slope->omega_BN_B[i];
+@WHEELS@    for (i = 0; i < KOZ_WHEELS; i++) to->wheel_momentum[i] = from->wheel_momentum[i] + h * slope->wheel_momentum[i];
 }
 
 /* Turn the body for a while with a constant torque (Runge-Kutta of order 4). */
-static void fly(rigid_body *body, const float torque_B[3], double seconds)
+static void fly(rigid_body *body, const float @HELD_TORQUE@, double seconds)
 {
     rigid_body k1, k2, k3, k4, at;
-    derivative(body, torque_B, &k1);
+    derivative(body, @HELD@, &k1);
     ahead(body, &k1, 0.5 * seconds, &at);
-    derivative(&at, torque_B, &k2);
+    derivative(&at, @HELD@, &k2);
     ahead(body, &k2, 0.5 * seconds, &at);
-    derivative(&at, torque_B, &k3);
+    derivative(&at, @HELD@, &k3);
     ahead(body, &k3, seconds, &at);
-    derivative(&at, torque_B, &k4);
+    derivative(&at, @HELD@, &k4);
     ahead(body, &k1, seconds / 6.0, body);
     ahead(body, &k2, seconds / 3.0, body);
     ahead(body, &k3, seconds / 3.0, body);
     ahead(body, &k4, seconds / 6.0, body);
 }
 
+@WHEELS@/* The total angular momentum [N m s] in inertial axes, where it stays. */
+@WHEELS@static void inertial_momentum(const rigid_body *body, double momentum_N[3])
+@WHEELS@{
+@WHEELS@    const double *q = body->q_BN, squared = q[0] * q[0] + dot(q + 1, q + 1);
+@WHEELS@    double momentum_B[3], t[3], u[3];
+@WHEELS@    int i;
+@WHEELS@    total_momentum(body, momentum_B);
+@WHEELS@    cross(q + 1, momentum_B, t);
+@WHEELS@    cross(q + 1, t, u);
+@WHEELS@    for (i = 0; i < 3; i++) momentum_N[i] = momentum_B[i] + 2.0 * (q[0] * t[i] + u[i]) / squared;
+@WHEELS@}
+@WHEELS@
 /* What sensors measure.  Like many a star tracker they give attitudes with a scalar part that is not negative. */
 static void measure(const rigid_body *body, koz_situation *now)
 {
@@ -87,6 +121,7 @@ static void measure(const rigid_body *body, koz_situation *now)
     int i;
     for (i = 0; i < 4; i++) now->q_BN[i] = (float)(scale * body->q_BN[i]);
     for (i = 0; i < 3; i++) now->omega_BN_B[i] = (float)body->omega_BN_B[i];
+@WHEELS@    for (i = 0; i < KOZ_WHEELS; i++) now->wheel_momentum[i] = (float)body->wheel_momentum[i];
 }
 
 /* Angle between the attitude and the target [deg]. */
@@ -130,11 +165,15 @@ int main(void)
     koz_memory memory;
     rigid_body body;
     float observation[KOZ_OBSERVATION_SIZE], requested_B[3], torque_B[3];
+@WHEELS@    float wheel_torque[KOZ_WHEELS];
+@WHEELS@    double start_N[3], end_N[3], changed = 0.0, fullest = 0.0;
     double error, margin, smallest = 360.0, settled_at = 0.0;
     int i, step, substep;
 
     for (i = 0; i < 4; i++) body.q_BN[i] = (double)now.q_BN[i];
     for (i = 0; i < 3; i++) body.omega_BN_B[i] = (double)now.omega_BN_B[i];
+@WHEELS@    for (i = 0; i < KOZ_WHEELS; i++) body.wheel_momentum[i] = (double)now.wheel_momentum[i];
+@WHEELS@    inertial_momentum(&body, start_N);
     printf("%8s %20s %18s\n", "time [s]", "pointing error [deg]", "margin [deg]");
 
     /* Once, at the start of a maneuver. */
@@ -154,6 +193,7 @@ int main(void)
 #else
         for (i = 0; i < 3; i++) torque_B[i] = requested_B[i];
 #endif
+@WHEELS@        koz_wheel_torques(&now, torque_B, wheel_torque);
         error = pointing_error(&now);
         margin = smallest_margin(&now);
         if (step % ROW_STEPS == 0)
@@ -161,11 +201,16 @@ int main(void)
         if (!(error <= SETTLED_DEG)) settled_at = (step + 1) * (double)KOZ_STEP_SECONDS;
         smallest = fmin(smallest, margin);
         for (substep = 0; substep < SUBSTEPS && step < STEPS; substep++) {
-            fly(&body, torque_B, (double)KOZ_STEP_SECONDS / SUBSTEPS);
+            fly(&body, @HELD@, (double)KOZ_STEP_SECONDS / SUBSTEPS);
             measure(&body, &now);
             smallest = fmin(smallest, smallest_margin(&now));
         }
+@WHEELS@        for (i = 0; i < KOZ_WHEELS; i++)
+@WHEELS@            fullest = fmax(fullest, fabs(body.wheel_momentum[i]) / wheel_max_momentum[i]);
     }
+@WHEELS@    inertial_momentum(&body, end_N);
+@WHEELS@    for (i = 0; i < 3; i++) changed = fmax(changed, fabs(end_N[i] - start_N[i]));
+@WHEELS@    printf("wheels: at most %.1f %% full; total angular momentum changed by %.1e N m s\n", 100.0 * fullest, changed);
     if (settled_at <= STEPS * (double)KOZ_STEP_SECONDS)
         printf("settled within %.2f deg in %.1f s, ", SETTLED_DEG, settled_at);
     else

@@ -6,6 +6,7 @@
 #include <stddef.h>
 
 #include "koz_math.h"
+@WHEELS@#include "koz_wheels.h"
 
 static const float pi = 3.14159265f;
 
@@ -22,9 +23,12 @@ static int is_direction(const float *v, int size)
 const char *koz_fault(const koz_situation *now)
 {
     int zone;
+@WHEELS@    int wheel;
     if (!is_direction(now->q_BN, 4)) return "q_BN: must be finite and not zero";
     if (!is_direction(now->q_DN, 4)) return "q_DN: must be finite and not zero";
     if (!(koz_dot(now->omega_BN_B, now->omega_BN_B) < 1e12f)) return "omega_BN_B: must be finite";
+@WHEELS@    for (wheel = 0; wheel < KOZ_WHEELS; wheel++)
+@WHEELS@        if (!(fabsf(now->wheel_momentum[wheel]) < 1e12f)) return "wheel_momentum: must be finite";
     for (zone = 0; zone < KOZ_ZONES; zone++) {
         if (!(fabsf(now->zone_half_angle[zone]) <= pi)) return "zone_half_angle: must be at most pi in radians";
         if (!is_direction(now->zone_axis_N[zone], 3) && now->zone_half_angle[zone] > 0.0f)
@@ -60,6 +64,7 @@ void koz_start(koz_memory *memory, const koz_situation *now)
     const koz_situation unit = koz_unit_situation(now);
     *memory = on_target;
     remember(memory, &unit);
+@WHEELS@    koz_wheels_limits(&unit, memory->torque_limit);
 }
 
 @SPACECRAFT@/* Unit vector from the boresight towards a zone's axis; zero where the two coincide. */
@@ -119,8 +124,15 @@ static void dense(const float *x, int inputs, const float *kernel, const float *
 @DECIDE@
 }
 
-@ONE@void koz_torque(const float observation[KOZ_OBSERVATION_SIZE], float torque_B[KOZ_ACTION_SIZE])
-@SEVERAL@void koz_torque(const koz_memory *memory, const float observation[KOZ_OBSERVATION_SIZE],
-@SEVERAL@    float torque_B[KOZ_ACTION_SIZE])
+@FORGETS@void koz_torque(const float observation[KOZ_OBSERVATION_SIZE], float torque_B[KOZ_ACTION_SIZE])
+@REMEMBERS@void koz_torque(const koz_memory *memory, const float observation[KOZ_OBSERVATION_SIZE],
+@REMEMBERS@    float torque_B[KOZ_ACTION_SIZE])
 {
 @TORQUE@}
+@WHEELS@
+@WHEELS@void koz_wheel_torques(const koz_situation *now, const float torque_B[3], float wheel_torque[KOZ_WHEELS])
+@WHEELS@{
+@WHEELS@    int wheel;
+@WHEELS@    for (wheel = 0; wheel < KOZ_WHEELS; wheel++) wheel_torque[wheel] = 0.0f;
+@WHEELS@    if (koz_fault(now) == NULL) koz_wheels_allocate(now, torque_B, wheel_torque);
+@WHEELS@}

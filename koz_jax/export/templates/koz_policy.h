@@ -7,6 +7,7 @@
 #define KOZ_OBSERVATION_SIZE @OBSERVATION_SIZE@
 #define KOZ_ZONES @ZONES@ /* zones to be told of */
 #define KOZ_OBSERVED_ZONES @OBSERVED_ZONES@ /* of which the policy sees the nearest */
+@WHEELS@#define KOZ_WHEELS @WHEEL_COUNT@
 @SEVERAL@#define KOZ_INSTRUMENTS @INSTRUMENTS@ /* that zones are for */
 #define KOZ_ACTION_SIZE @ACTION_SIZE@
 #define @LIMIT_DEFINITION@
@@ -30,6 +31,7 @@ typedef struct {
     float q_DN[4];       /* target attitude; of either sign, the same one from koz_start on */
     float zone_axis_N[KOZ_ZONES][3];  /* unit vectors to the bright objects, in inertial axes */
     float zone_half_angle[KOZ_ZONES]; /* [rad]; -pi where there is no zone */
+@WHEELS@    float wheel_momentum[KOZ_WHEELS]; /* [N m s] of each wheel about its axis */
 @SEVERAL@    int zone_instrument[KOZ_ZONES];   /* number of the instrument that the zone is for, from 0 */
 } koz_situation;
 
@@ -51,10 +53,17 @@ void koz_observe(koz_memory *memory, const koz_situation *now, float observation
 void koz_decide(const float observation[KOZ_OBSERVATION_SIZE], float action[KOZ_ACTION_SIZE]);
 
 /* Torque in body axes [N m], to be held for KOZ_STEP_SECONDS; zero where an observation is not finite. */
-@SEVERAL@/* It needs the memory as the koz_observe left it that made the observation. */
-@ONE@void koz_torque(const float observation[KOZ_OBSERVATION_SIZE], float torque_B[KOZ_ACTION_SIZE]);
-@SEVERAL@void koz_torque(const koz_memory *memory, const float observation[KOZ_OBSERVATION_SIZE],
-@SEVERAL@    float torque_B[KOZ_ACTION_SIZE]);
+@REMEMBERS@/* It needs the memory as the koz_observe left it that made the observation. */
+@FORGETS@void koz_torque(const float observation[KOZ_OBSERVATION_SIZE], float torque_B[KOZ_ACTION_SIZE]);
+@REMEMBERS@void koz_torque(const koz_memory *memory, const float observation[KOZ_OBSERVATION_SIZE],
+@REMEMBERS@    float torque_B[KOZ_ACTION_SIZE]);
+@WHEELS@
+@WHEELS@/*
+@WHEELS@ * What each wheel has to do for torque_B: the torque [N m] that it gives the body for KOZ_STEP_SECONDS, by which its own
+@WHEELS@ * momentum falls.  They add what their momentum takes while the body turns; where one of them is at the end of its
+@WHEELS@ * torque or of its momentum, all give less.  Zero where koz_fault finds a fault.
+@WHEELS@ */
+@WHEELS@void koz_wheel_torques(const koz_situation *now, const float torque_B[3], float wheel_torque[KOZ_WHEELS]);
 
 #ifdef __cplusplus
 }

@@ -11,8 +11,9 @@ import numpy.typing as npt
 from koz_jax.config.task import SpacecraftConfig
 from koz_jax.errors import SettingsError
 from koz_jax.task import host
+from koz_jax.task.any_spacecraft.host_wheels import HostWheels
 from koz_jax.task.host import Floats
-from koz_jax.task.observation_layout import FREE_RATE, FULL_ACTION, SHORTEST_STEP
+from koz_jax.task.observation_layout import FREE_RATE, FULL_ACTION, LEAST_RATE, SHORTEST_STEP
 
 
 class Constants(NamedTuple):
@@ -22,9 +23,10 @@ class Constants(NamedTuple):
     inertia: float  # [kg m^2] J, a third of the trace of the inertia
     torque: float  # [N m] u, the root mean square of the torque limits over the axes
     axes: Floats  # (3, 3) rows: the policy's axes in body components, x along the instrument
-    seen: dict[str, Floats]  # parts of the observation that are of the spacecraft, by their names in the layout
+    seen: dict[str, Floats]  # parts of the observation that are of the spacecraft, by their names in the layout; of one
+    # with wheels, reach and rate limit are those of the start, at rest
     torque_per_action: Floats  # (3, 3) [N m] takes an action to a torque in body axes
-    torque_limits: Floats  # (3,) [N m] at which each component of that torque is clipped
+    torque_limits: Floats  # (3,) [N m] at which each component of that torque is clipped; of wheels, those at rest
 
 
 def of(spacecraft: SpacecraftConfig, step_seconds: float, boresight: npt.ArrayLike | None = None) -> Constants:
@@ -33,26 +35,36 @@ def of(spacecraft: SpacecraftConfig, step_seconds: float, boresight: npt.ArrayLi
     step_seconds: time step [s]; boresight: (3,) unit vector of an instrument in body axes, by default the spacecraft's.
 
     Raises:
-        SettingsError: it has wheels or gyros, whose limits are no constants.
+        SettingsError: it has gyros.
 
     """
     if spacecraft.gyros:
-        raise SettingsError("spacecraft.gyros: are flown by jax only so far; allowed here is torque_limit")
-    if spacecraft.wheels:
-        raise SettingsError("spacecraft.wheels: are flown by jax only so far; allowed here is torque_limit")
+        raise SettingsError("spacecraft.gyros: are flown by jax only so far; allowed here are torque_limit and wheels")
     axes = policy_axes(host.unit("boresight", spacecraft.boresight if boresight is None else boresight, 3))
     inertia_B, limits = np.array(spacecraft.inertia), np.array(spacecraft.torque_limits)
     time, torque = spacecraft.time_unit, spacecraft.strength
     inertia = float(np.trace(inertia_B)) / 3.0
     tensor = axes @ inertia_B @ axes.T / inertia
-    rate = np.inf if spacecraft.max_rate_deg is None else np.deg2rad(spacecraft.max_rate_deg)
     seen = {
         "inertia": np.array([*np.diag(tensor), tensor[0, 1], tensor[0, 2], tensor[1, 2]]),
         "reach": np.min(limits / np.maximum(np.abs(axes), 1e-6), axis=1) / torque,
         "step": np.log([max(step_seconds / (time * SHORTEST_STEP), 1.0)]),
-        "rate_limit": np.log([min(rate * time / FREE_RATE, 1.0)]),
+        "rate_limit": seen_rate(_largest_rate(spacecraft), time),
     }
     return Constants(time, inertia, torque, axes, seen, FULL_ACTION * torque / inertia * inertia_B @ axes.T, limits)
+
+
+def seen_rate(largest: float, time: float) -> Floats:
+    """Part of the observation that a largest rate [rad/s] is, with the unit of time [s].  Returns (1,)."""
+    return np.log([np.clip(largest * time / FREE_RATE, LEAST_RATE, 1.0)])
+
+
+def _largest_rate(spacecraft: SpacecraftConfig) -> float:
+    """At the start, at rest [rad/s]."""
+    if spacecraft.wheels:
+        wheels = HostWheels(spacecraft)
+        return wheels.largest_rate(wheels.momentum_at_start, np.zeros(3))
+    return np.inf if spacecraft.max_rate_deg is None else float(np.deg2rad(spacecraft.max_rate_deg))
 
 
 def policy_axes(boresight_B: Floats) -> Floats:

@@ -11,12 +11,9 @@ import jax.numpy as jnp
 from koz_jax.task import dynamics, observation, pointing_constraints, rotations
 from koz_jax.task.any_spacecraft import units
 from koz_jax.task.any_spacecraft.units import Units
-from koz_jax.task.observation_layout import FREE_RATE, FULL_ACTION, SHORTEST_STEP, layout, zone_part
+from koz_jax.task.observation_layout import FREE_RATE, FULL_ACTION, LEAST_RATE, SHORTEST_STEP, layout, zone_part
 from koz_jax.task.pointing_constraints import PointingConstraint
 from koz_jax.task.state import EnvState, Model, attitude_error, largest_rate, torque_limits
-
-# Of the rate from which there is no limit, what a policy tells apart from no rate at all.
-_LEAST_RATE = 1e-3
 
 
 def observe(state: EnvState, model: Model, urgency: jax.Array | float, zones: int = 1) -> jax.Array:
@@ -54,7 +51,7 @@ def _rate_limit(largest: jax.Array | None, own: Units) -> jax.Array:
     """Log of the rate limit () [rad/s] over that from which it is none.  Returns (), 0 where there is none."""
     if largest is None:
         return jnp.zeros(())
-    return jnp.log(jnp.clip(largest * own.time / FREE_RATE, _LEAST_RATE, 1.0))
+    return jnp.log(jnp.clip(largest * own.time / FREE_RATE, LEAST_RATE, 1.0))
 
 
 def _entries(tensor: jax.Array) -> jax.Array:

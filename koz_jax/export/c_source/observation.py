@@ -9,14 +9,15 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from koz_jax.export import c_text
+from koz_jax.export.c_source import literals
 from koz_jax.export.golden import Golden
 from koz_jax.export.metadata import Metadata, Scaling
+from koz_jax.task.observation_layout import FREE_RATE, LEAST_RATE, slices
 
 _OF_ONE = {
     "URGENCY_DEFINITION": "",
-    "MEMORY_FIELD": "",
-    "MEMORY_START": "",
+    "MEMORY_FIELD": "@LIMITS_FIELD@",
+    "MEMORY_START": "@NO_LIMITS@",
     "SPACECRAFT": "",
     "OBSERVE_BODY": """    observation[15] = memory->q_e[0];
     remember(memory, &unit);
@@ -30,11 +31,11 @@ _OF_ONE = {
     "ZONE_DIRECTION": "        zone_direction(&unit, nearest, part + 2);\n",
     "WHICH_ABSENT": "place > 0 && ",
     "ABSENT_BORESIGHT": "",
-    "OBSERVE_SPACECRAFT": "",
+    "OBSERVE_SPACECRAFT": "@WHEELS@    koz_wheels_limits(&unit, memory->torque_limit);\n",
     "TORQUE": """    int i;
     koz_decide(observation, torque_B);
     for (i = 0; i < KOZ_ACTION_SIZE; i++)
-        torque_B[i] = fabsf(torque_B[i]) <= 1.0f ? torque_B[i] * @LIMIT_OF_I@ : 0.0f;
+        torque_B[i] = fabsf(torque_B[i]) <= 1.0f ? torque_B[i] * @LEFT_OF_I@ : 0.0f;
 """,
     "MEMORY_CHECK": "        for (i = 0; i < 4; i++) observed = worse(observed, memory.q_e[i], observations[n][i]);\n",
     "EXPECTED_TORQUE": "@LIMIT_OF_I@ * actions[n][i]",
@@ -50,9 +51,9 @@ _OF_ANY = {
 
 """,
     "MEMORY_FIELD": """    float urgency; /* from 0 to 1, yours to set at any time after koz_start */
-@SEVERAL@    int instrument; /* that of the nearest zone, whose axes are the policy's */
+@LIMITS_FIELD@@SEVERAL@    int instrument; /* that of the nearest zone, whose axes are the policy's */
 """,
-    "MEMORY_START": ", (float)(KOZ_URGENCY)@NO_INSTRUMENT@",
+    "MEMORY_START": ", (float)(KOZ_URGENCY)@NO_LIMITS@@NO_INSTRUMENT@",
     "SPACECRAFT": """static const float policy_axes@OF_INSTRUMENTS@[3][3] = {@AXES@}; /* rows in body components */
 static const float rate_to_policy@OF_INSTRUMENTS@[3][3] = {@RATE_TO_POLICY@}; /* [s] the same times T */
 static const float constant_parts@OF_INSTRUMENTS@[@SEEN_COUNT@] = {@SEEN@}; /* @SEEN_NAMES@ */
@@ -70,8 +71,16 @@ static float usable(float urgency)
     return urgency < 0.0f ? 0.0f : urgency > 1.0f ? 1.0f : (float)(KOZ_URGENCY);
 }
 
+@WHEELS@/* How the policy sees a largest rate [rad/s]. */
+@WHEELS@static float seen_rate(float largest)
+@WHEELS@{
+@WHEELS@    const float share = largest / @FREE_RATE@;
+@WHEELS@    return logf(share > 1.0f ? 1.0f : share < @LEAST_RATE@ ? @LEAST_RATE@ : share);
+@WHEELS@}
+@WHEELS@
 """,
     "OBSERVE_BODY": """    float direction_B[3];
+@WHEELS@    const float share = koz_wheels_share(&unit);
     remember(memory, &unit);
 """,
     # The boresight stands before the margin, and only of zones after the first.
@@ -85,6 +94,9 @@ static float usable(float urgency)
     multiply(policy_axes@OF_MEMORY@, memory->q_e + 1, observation + 1);
     multiply(rate_to_policy@OF_MEMORY@, unit.omega_BN_B, observation + 4);
     for (i = 0; i < @SEEN_COUNT@; i++) observation[4 + 8 * KOZ_OBSERVED_ZONES + i] = constant_parts@OF_MEMORY@[i];
+@WHEELS@    koz_wheels_limits(&unit, memory->torque_limit);
+@WHEELS@    for (i = 0; i < 3; i++) observation[@REACH@ + i] *= share;
+@WHEELS@    observation[@RATE_LIMIT@] = seen_rate(koz_wheels_largest_rate(&unit));
     observation[KOZ_OBSERVATION_SIZE - 1] = 2.0f * usable(memory->urgency) - 1.0f;
 """,
     "TORQUE": """    float action[KOZ_ACTION_SIZE];
@@ -92,7 +104,7 @@ static float usable(float urgency)
     koz_decide(observation, action);
     multiply(torque_per_action@OF_GIVEN_MEMORY@, action, torque_B);
     for (i = 0; i < KOZ_ACTION_SIZE; i++) {
-        const float limit = @LIMIT_OF_I@;
+        const float limit = @LEFT_OF_I@;
         torque_B[i] = torque_B[i] > limit ? limit : torque_B[i] < -limit ? -limit : torque_B[i];
         if (!(fabsf(torque_B[i]) <= limit)) torque_B[i] = 0.0f;
     }
@@ -106,6 +118,9 @@ static const float torques[COUNT][KOZ_ACTION_SIZE] = {
 """,
 }
 
+# Of any policy for a spacecraft with wheels.
+_ON_WHEELS = {name: _OF_ANY[name] for name in ("EXPECTED_TORQUE", "TORQUES")}
+
 # Of a policy for any spacecraft that sees several zones.
 _FURTHER = {
     "FURTHER_ZONE": """        if (place > 0)
@@ -118,31 +133,40 @@ _FURTHER = {
 
 def replacements(metadata: Metadata, vectors: Golden) -> dict[str, str]:
     """Text by placeholder; that of the first ones holds others, which come after them."""
+    numbers = {"MEMORIES": ",\n".join(_memory(each, metadata) for each in vectors.memory)}
+    numbers |= {"TORQUE_ROWS": literals.rows(vectors.torque)}
     if metadata.scaling is None:
-        return _OF_ONE | {"MEMORIES": ",\n".join(f"    {{{c_text.braced(q_e)}}}" for q_e in vectors.memory)}
-    starts = ((c_text.braced(each[:4]), c_text.number(each[4])) for each in vectors.memory)
-    memories = (f"    {{{q_e}, {urgency}@NO_INSTRUMENT@}}" for q_e, urgency in starts)
+        return _OF_ONE | (_ON_WHEELS if metadata.task.spacecraft.wheels else {}) | numbers
     scalings = [metadata.scaling, *(instrument.scaling for instrument in metadata.further_instruments)]
     further = _FURTHER if metadata.network.observed_zones > 1 else dict.fromkeys(_FURTHER, "")
-    numbers = {"MEMORIES": ",\n".join(memories), "TORQUE_ROWS": c_text.rows(vectors.torque)}
-    return _OF_ANY | further | numbers | _constants(scalings)
+    return _OF_ANY | further | numbers | _constants(scalings, metadata.network.observed_zones)
 
 
-def _constants(scalings: Sequence[Scaling]) -> dict[str, str]:
-    """Those of each instrument."""
-    own = scalings[0]
+def _memory(row: np.ndarray, metadata: Metadata) -> str:
+    """Initialiser of a memory of the self-test.  row: as of ``Golden``."""
+    urgency = "" if metadata.scaling is None else f", {literals.number(row[4])}"
+    return f"    {{{literals.braced(row[:4])}{urgency}@NO_LIMITS@@NO_INSTRUMENT@}}"
+
+
+def _constants(scalings: Sequence[Scaling], zones: int) -> dict[str, str]:
+    """Those of each instrument, and where what wheels change stands in the observation of so many zones."""
+    own, where = scalings[0], slices(zones, scaled=True)
 
     def each(text: Callable[[Scaling], str]) -> str:
-        return c_text.of_each([text(scaling) for scaling in scalings])
+        return literals.of_each([text(scaling) for scaling in scalings])
 
     return {
-        "URGENCY": c_text.number(own.urgency),
-        "AXES": each(lambda scaling: c_text.matrix(scaling.axes)),
-        "RATE_TO_POLICY": each(lambda scaling: c_text.matrix(scaling.time_unit * np.array(scaling.axes))),
+        "URGENCY": literals.number(own.urgency),
+        "AXES": each(lambda scaling: literals.matrix(scaling.axes)),
+        "RATE_TO_POLICY": each(lambda scaling: literals.matrix(scaling.time_unit * np.array(scaling.axes))),
         "SEEN_COUNT": str(len(_seen(own))),
         "SEEN_NAMES": ", ".join(own.seen),
-        "SEEN": each(lambda scaling: c_text.row(_seen(scaling))),
-        "TORQUE_PER_ACTION": each(lambda scaling: c_text.matrix(scaling.torque_per_action)),
+        "SEEN": each(lambda scaling: literals.row(_seen(scaling))),
+        "REACH": str(where["reach"].start),
+        "RATE_LIMIT": str(where["rate_limit"].start),
+        "FREE_RATE": literals.number(FREE_RATE / own.time_unit),
+        "LEAST_RATE": literals.number(LEAST_RATE),
+        "TORQUE_PER_ACTION": each(lambda scaling: literals.matrix(scaling.torque_per_action)),
     }
 
 

@@ -21,6 +21,11 @@ def exact_row(values: Iterable[float]) -> str:
     return ", ".join(repr(float(value)) for value in values)
 
 
+def exact_matrix(table: Iterable[Iterable[float]]) -> str:
+    """Initialisers of the rows of a small matrix in double precision, on one line."""
+    return ", ".join(f"{{{exact_row(each)}}}" for each in table)
+
+
 def braced(values: Iterable[float]) -> str:
     """An initialiser of an array."""
     return f"{{{row(values)}}}"
@@ -41,17 +46,20 @@ def of_each(texts: Sequence[str]) -> str:
     return texts[0] if len(texts) == 1 else ", ".join(f"{{{text}}}" for text in texts)
 
 
-def situations(table: np.ndarray, instruments: int) -> str:
-    """Initialisers of ``koz_situation``.  table: (n, 11 + 4 zones), of several instruments (n, 11 + 5 zones)."""
-    return ",\n".join(f"    {situation(each, instruments)}" for each in table)
+def situations(table: np.ndarray, zones: int, wheels: int) -> str:
+    """Initialisers of ``koz_situation``, one on a line.  table: (n, entries), rows as of ``situation``."""
+    return ",\n".join(f"    {situation(each, zones, wheels)}" for each in table)
 
 
-def situation(values: np.ndarray, instruments: int) -> str:
-    """Initialiser of a ``koz_situation``.  values: (11 + 4 zones,), of several instruments (11 + 5 zones,)."""
-    zones = (len(values) - 11) // (4 if instruments == 1 else 5)
-    parts = np.split(values, np.cumsum([4, 3, 4, 3 * zones, zones]))
-    q_BN, omega, q_DN, axes, half_angles, numbers = parts
+def situation(values: np.ndarray, zones: int, wheels: int) -> str:
+    """Initialiser of a ``koz_situation``.
+
+    values: (11 + 4 zones + wheels,), and the number of each zone's instrument where there are several.
+    """
+    parts = np.split(values, np.cumsum([4, 3, 4, 3 * zones, zones, wheels]))
+    q_BN, omega, q_DN, axes, half_angles, momenta, numbers = parts
     attitude = ", ".join(braced(part) for part in (q_BN, omega, q_DN))
     axis_rows = ", ".join(braced(axis) for axis in axes.reshape(zones, 3))
-    which = "" if instruments == 1 else f", {{{', '.join(str(int(number)) for number in numbers)}}}"
-    return f"{{{attitude}, {{{axis_rows}}}, {braced(half_angles)}{which}}}"
+    held = f", {braced(momenta)}" if wheels else ""
+    which = f", {{{', '.join(str(int(number)) for number in numbers)}}}" if len(numbers) else ""
+    return f"{{{attitude}, {{{axis_rows}}}, {braced(half_angles)}{held}{which}}}"

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 
 from koz_jax.agents.numpy_policy import NumpyPolicy
-from koz_jax.export.c_text import number, row
+from koz_jax.export.c_source.literals import number, row
 from koz_jax.sac.dials import DIAL_FEATURES, spacing
 from koz_jax.task.observation_layout import size
 
