@@ -60,8 +60,6 @@ def export(
         from koz_jax.export.stablehlo import stablehlo_files
 
         return stablehlo_files(agent, metadata)
-    if shield is not None and made.task.spacecraft.wheels:
-        raise SettingsError("shield: is not exported for a spacecraft with wheels yet; leave it out")
     vectors = golden(made, GOLDEN_VECTORS, further_boresights=further)
     contents = c_files(policy, metadata, vectors, example(made, bool(further)))
     if shield is None:

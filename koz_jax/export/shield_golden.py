@@ -1,5 +1,6 @@
 """Golden vectors of the shield: what it makes of requests everywhere, at a zone's edge, and inside a zone."""
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -39,7 +40,7 @@ _STEADY = 1e-2  # of the torque limit: another candidate is farther away
 class ShieldGolden(NamedTuple):
     """Situations and what the shield makes of them, none close to a threshold; leading axis (count,)."""
 
-    situation: np.ndarray  # (count, 11 + 4 zones) float32, of several instruments (count, 11 + 5 zones)
+    situation: np.ndarray  # (count, entries) float32, rows as in ``Golden``
     requested: np.ndarray  # (count, 3) float32 [N m]
     allowed: np.ndarray  # (count, 3) float32 [N m]
     safe: np.ndarray  # (count,) bool, whether the situation itself is safe
@@ -81,7 +82,8 @@ def shield_golden(
     made = shield.from_config(config, model)
     drawn, kind = shield_situations(agent, config, _DRAWN_PER_VECTOR * count, seed, further_boresights)
     box = np.random.default_rng(seed).uniform(np.negative(limits), limits, (_DRAWN_PER_VECTOR * count, 3))
-    requested = box.astype(np.float32)
+    left = np.asarray(_left(drawn, model, boresights_B))
+    requested = np.clip(box.astype(np.float32), -left, left)
     allowed, _ = _answer(made, drawn, requested, model, boresights_B, _Variant())
     tried = _in_turn(np.arange(len(kind)), 2 * kind + np.all(allowed == requested, axis=1))[: _TRIED_PER_VECTOR * count]
     drawn, requested, kind = jax.tree.map(lambda leaf: leaf[tried], (drawn, requested, kind))
@@ -139,6 +141,13 @@ def _in_turn(chosen: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 
 @jax.jit
+@functools.partial(jax.vmap, in_axes=(0, None, None))
+def _left(situation: Situation, model: Model, boresights_B: jax.Array) -> jax.Array:
+    """What can be asked for in each situation.  Returns (count, 3) [N m]."""
+    return state.torque_limits(situation.state(model, boresights_B), model).box_B
+
+
+@jax.jit
 def _answer(
     made: Shield,
     drawn: Situation,
@@ -157,8 +166,9 @@ def _answer(
             omega_BN_B=(1.0 + variant.rate) * situation.omega_BN_B,
         )
         at = told.state(model, boresights_B)
-        zones = at.scenario.constraints
-        allowed_B = made.filter(at.body, torque_B, zones, state.torque_limits(at, model), model)
-        return allowed_B, shield.is_safe(made, at.body, zones, model)
+        limits = state.torque_limits(at, model)
+        torque_B = jnp.clip(torque_B, -limits.box_B, limits.box_B)
+        allowed_B = made.in_state(at, model).filter(at.body, torque_B, at.scenario.constraints, limits, model)
+        return jnp.clip(allowed_B, -limits.box_B, limits.box_B), made.covers(at, model)
 
     return jax.vmap(one)(drawn, requested)

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import oracle, spacecraft
+from support import blank, oracle, spacecraft, tiny
 
 from koz_jax.agents.agent import Agent, load_agent
-from koz_jax.agents.numpy_policy import exported_zone_count
+from koz_jax.config.maneuvers.maneuver_file import load_spacecraft
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.uncertainty import UncertaintyConfig
@@ -21,7 +21,6 @@ from koz_jax.export import files
 from koz_jax.export.files import export, write_files
 from koz_jax.export.golden import EXAMPLE_CASE
 from koz_jax.export.library import CLibrary
-from koz_jax.export.shield_golden import ShieldGolden
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 
@@ -67,27 +66,23 @@ def of_other_task(agent: Agent) -> Agent:
     return dataclasses.replace(agent, task=task.model_copy(update={"spacecraft": body, "scenario": scenario}))
 
 
-def blank_vectors(agent: Agent, config: ShieldConfig, count: int, further_boresights: tuple = ()) -> ShieldGolden:
-    """Vectors of the right shape for a self-test that is compiled and not run: none need be searched for."""
-    zones = exported_zone_count(agent.controller.network, agent.task.scenario)
-    torques, size = np.zeros((count, 3), np.float32), 11 + (5 if further_boresights else 4) * zones
-    return ShieldGolden(np.zeros((count, size), np.float32), torques, torques, np.zeros(count, bool))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
-@pytest.mark.parametrize("kind", ["plain", "robust", "unequal", "scaled", "instruments"])
+@pytest.mark.parametrize("kind", ["plain", "robust", "unequal", "scaled", "instruments", "wheels"])
 def test_everything_compiles_without_a_warning(agent, folder, tmp_path, monkeypatch, compiler, kind):
     if shutil.which(compiler) is None:
         pytest.skip(f"there is no {compiler}")
     where = folder
     if kind != "plain":
         where = tmp_path
-        monkeypatch.setattr(files, "shield_golden", blank_vectors)
+        monkeypatch.setattr(files, "golden", blank.golden)
+        monkeypatch.setattr(files, "shield_golden", blank.shield_golden)
         several = spacecraft.agent(spacecraft.SCALED.model_copy(update={"observed_zones": 3}))
         exported = {"robust": agent, "unequal": of_other_task(agent), "scaled": spacecraft.agent()}.get(kind, several)
-        others = ((0.0, 0.0, -1.0), (-0.6, 0.8, 0.0)) if kind == "instruments" else ()
-        write_files(where, export(exported, "c", ROBUST, further_boresights=others))
+        others = ((0.0, 0.0, -1.0), (-0.6, 0.8, 0.0)) if kind in ("instruments", "wheels") else ()
+        task = load_spacecraft(tiny.ROOT / "examples" / "leo_6u.toml").task if kind == "wheels" else None
+        config = ShieldConfig() if kind == "wheels" else ROBUST
+        write_files(where, export(exported, "c", config, task, others))
     for name in SOURCES:
         knows = b"KOZ_WITH_SHIELD" in (where / name).read_bytes()
         for defined in ((), ("-DKOZ_WITH_SHIELD",)) if knows else ((),):

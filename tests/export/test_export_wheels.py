@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from support import spacecraft, tiny
+from support import blank, spacecraft, tiny
 
 import koz_jax
 from koz_jax.agents.numpy_observer import ScaledObserver, scaled_observer_of
@@ -22,7 +22,7 @@ from koz_jax.evaluation import cases, maneuver
 from koz_jax.export import files
 from koz_jax.export.c_source.wheels import WHEEL_FILES
 from koz_jax.export.files import export, made_for, write_files
-from koz_jax.export.golden import Golden, golden
+from koz_jax.export.golden import golden
 from koz_jax.export.library import CLibrary
 from koz_jax.export.metadata import describe
 from koz_jax.task.environment import Reorientation
@@ -270,7 +270,7 @@ def row_of(at: EnvState, looks_B: np.ndarray) -> np.ndarray:
 def test_c_in_the_loop_flies_a_satellite_on_wheels_as_the_core_does(tmp_path, monkeypatch):
     """With moving cones and two instruments; the momentum of the wheels is measured at every step."""
     # The self-test is not run, so nothing need be drawn for it.
-    monkeypatch.setattr(files, "golden", lambda *_, **__: Golden(*(np.zeros((1, n)) for n in (35, 9, 48, 3, 3, 4))))
+    monkeypatch.setattr(files, "golden", blank.golden)
     own, agent = koz_jax.load_maneuver(tiny.ROOT / "examples" / "leo_6u.toml"), koz_jax.load_agent("universal")
     task = own.task.model_copy(update={"episode_seconds": 30.0})
     further = tuple(instrument.boresight for instrument in own.instruments[1:])

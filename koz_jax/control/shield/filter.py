@@ -57,23 +57,24 @@ class Shield(struct.PyTreeNode):
         safe = is_safe(self, at.body, at.scenario.constraints, model)
         if model.actuators.stored_momentum(at.actuators) is None:
             return safe
-        limit = self._limit_now(at, model)
+        limit = self.in_state(at, model).rate_limit
         return safe & (True if limit is None else limit.squared_peak(at.body) <= limit.squared)
 
     def allow(self, measured: EnvState, action: jax.Array, model: Model) -> Allowed:
         """What is let through in place of the requested action (3,) in [-1, 1]; the brake at the worst."""
         limits = torque_limits(measured, model)
         torque_B = limits.box_B * action
-        now = self.replace(rate_limit=self._limit_now(measured, model))
+        now = self.in_state(measured, model)
         allowed_B = now.filter(measured.body, torque_B, measured.scenario.constraints, limits, model)
         # What passes comes back to the last bit, also where the limit is no power of two.
         passed = jnp.where(jnp.all(allowed_B == torque_B), action, allowed_B / limits.box_B)
         return Allowed(passed, jnp.array(True))
 
-    def _limit_now(self, measured: EnvState, model: Model) -> RateLimit | None:
+    def in_state(self, measured: EnvState, model: Model) -> "Shield":
+        """The shield with the rate limit of a state, which depends on the momentum that actuators store."""
         if self.rate_limit is None or model.actuators.stored_momentum(measured.actuators) is None:
-            return self.rate_limit
-        return rate_limit.now(self.rate_limit, self.brake.rate_error, measured, model)
+            return self
+        return self.replace(rate_limit=rate_limit.now(self.rate_limit, self.brake.rate_error, measured, model))
 
     def filter(
         self,

@@ -25,7 +25,7 @@ def shield_files(metadata: Metadata, config: ShieldConfig, vectors: ShieldGolden
     zones, wheels = exported_zone_count(metadata.network, metadata.task.scenario), len(metadata.task.spacecraft.wheels)
     replacements = {
         "MARGIN_DEG": f"{np.rad2deg(made.margin):.4g}",
-        "MAX_RATE_DEG": "what torques allow" if model.max_rate is None else f"{np.rad2deg(model.max_rate):.4g} deg/s",
+        "MAX_RATE_DEG": _largest_rate(model, wheels),
         "CONE_RATE_DEG": f"{config.cone_rate_deg:g}",
         "GUIDE_RATE_DEG": f"{np.rad2deg(made.guide.rate):.4g}",
         **{f"STATED_{name.upper()}": f"{error:g}" for name, error in config.error_bounds.model_dump().items()},
@@ -39,6 +39,14 @@ def shield_files(metadata: Metadata, config: ShieldConfig, vectors: ShieldGolden
         **_shield_constants(made, model, metadata),
     }
     return template.filled(SHIELD_FILES, metadata, replacements)
+
+
+def _largest_rate(model: Model, wheels: int) -> str:
+    """What the shield keeps the rate below, in words."""
+    limit = None if model.max_rate is None else f"{np.rad2deg(model.max_rate):.4g} deg/s"
+    if wheels:
+        return "what wheels can stop" + (f", and {limit}" if limit else "")
+    return limit or "what torques allow"
 
 
 def _shield_constants(made: shield.Shield, model: Model, metadata: Metadata) -> dict[str, str]:

@@ -58,6 +58,9 @@ def replacements(variant: Variant) -> dict[str, str]:
         "LIMITS_FIELD": _LIMITS_FIELD if variant.wheels else "",
         "NO_LIMITS": ", {0.0f, 0.0f, 0.0f}" if variant.wheels else "",
         "LEFT_OF_I": "memory->torque_limit[i]" if variant.wheels else "@LIMIT_OF_I@",
+        "NOW_LIMIT_OF_I": "limit_B[i]" if variant.wheels else "@LIMIT_OF_I@",
+        "LIMIT_ARGUMENT": "limit_B, " if variant.wheels else "",
+        "RATE_ARGUMENT": "at.squared_rate, " if variant.wheels else "",
         "HELD": "wheel_torque" if variant.wheels else "torque_B",
         "HELD_TORQUE": "wheel_torque[KOZ_WHEELS]" if variant.wheels else "torque_B[3]",
     }

@@ -10,6 +10,7 @@
 #include <stddef.h>
 
 #include "koz_math.h"
+@WHEELS@#include "koz_wheels.h"
 
 #if KOZ_EXPORT_ID != @EXPORT_ID@
 #error "this shield and koz_policy.h are of different exports"
@@ -41,7 +42,7 @@ static const float least_gain = @RAISE@; /* [rad] of clearance */
 static const float request_shares[REQUEST_SHARES] = {@REQUEST_SHARES@};
 static const float guide_shares[GUIDE_SHARES] = {@GUIDE_SHARES@};
 static const float rate_form[3][3] = {@RATE_FORM@}; /* w.M w: squared largest rate of free motion; 0: no limit */
-static const float squared_rate = @SQUARED_RATE@; /* [(rad/s)^2] its limit */
+@NO_WHEELS@static const float squared_rate = @SQUARED_RATE@; /* [(rad/s)^2] its limit */
 static const float rate_rounding = @RATE_ROUNDING@;
 static const float unbounded = 1e9f; /* [rad] more than any margin */
 
@@ -305,7 +306,8 @@ static void brake(const body_state *body, float torque_B[3])
 }
 
 /* Torque within the box that takes up a rate. */
-static void take_up(const body_state *body, const float rate_B[3], float torque_B[3])
+@NO_WHEELS@static void take_up(const body_state *body, const float rate_B[3], float torque_B[3])
+@WHEELS@static void take_up(const body_state *body, const float limit_B[3], const float rate_B[3], float torque_B[3])
 {
     float wanted_B[3], momentum_B[3], gyroscopic_B[3], largest = 0.0f;
     int i;
@@ -315,7 +317,7 @@ static void take_up(const body_state *body, const float rate_B[3], float torque_
     koz_cross(body->omega_BN_B, momentum_B, gyroscopic_B);
     for (i = 0; i < 3; i++) {
         torque_B[i] += gyroscopic_B[i];
-        largest = larger(largest, fabsf(torque_B[i]) / @LIMIT_OF_I@);
+        largest = larger(largest, fabsf(torque_B[i]) / @NOW_LIMIT_OF_I@);
     }
     largest = larger(1.0f, largest);
     for (i = 0; i < 3; i++) torque_B[i] /= largest;
@@ -330,6 +332,7 @@ static float guide(
 {
     float to_body[4], axis_B[3], look_N[3], out_B[3], nearest_B[3] = {0.0f, 0.0f, 0.0f}, side_B[3], rate_B[3];
     float momentum_B[3], gyroscopic_B[3], pushed_B[3], soon_B[3], missing_B[3] = {0.0f, 0.0f, 0.0f};
+@WHEELS@    float limit_B[3];
     float margin, size, missing, sideways, nearest = unbounded;
 @SEVERAL@    const float *look_B = koz_boresight_B[0]; /* that of the nearest zone */
     int zone, i;
@@ -361,8 +364,9 @@ static float guide(
     for (i = 0; i < 3; i++) soon_B[i] = body->omega_BN_B[i] + guide_ahead * guide_seconds * soon_B[i];
     sideways = koz_dot(soon_B, side_B) >= 0.0f ? guide_rate : -guide_rate;
     for (i = 0; i < 3; i++) rate_B[i] = sideways * side_B[i] + guide_tilt * guide_rate * nearest_B[i] + missing_B[i];
-    take_up(body, rate_B, around_B);
-    take_up(body, missing_B, away_B);
+@WHEELS@    koz_wheels_limits(now, limit_B);
+    take_up(body, @LIMIT_ARGUMENT@rate_B, around_B);
+    take_up(body, @LIMIT_ARGUMENT@missing_B, away_B);
     return nearest;
 }
 
@@ -375,10 +379,20 @@ static body_state body_of(const koz_situation *now)
     return body;
 }
 
+@WHEELS@/* Square of the rate [rad/s] that the wheels can stop, by the momentum that is on board. */
+@WHEELS@static float squared_limit(const koz_situation *now)
+@WHEELS@{
+@WHEELS@    const float rate = larger(koz_wheels_largest_rate(now) - rate_error, 0.0f);
+@WHEELS@    return rate * rate;
+@WHEELS@}
+@WHEELS@
+@WHEELS@static float squared_peak(const float omega_B[3]);
+@WHEELS@
 int koz_is_safe(const koz_situation *now)
 {
     const koz_situation unit = koz_unit_situation(now);
     const body_state body = body_of(&unit);
+@WHEELS@    if (!(squared_peak(body.omega_BN_B) <= squared_limit(&unit))) return 0;
     return koz_fault(now) == NULL && clearance(&unit, &body, 0.0f, shield_margin) >= shield_margin;
 }
 
@@ -386,6 +400,7 @@ typedef struct {
     const koz_situation *now;
     body_state body;
     float present; /* [rad] clearance of braking, where what is no worse will do; else unbounded */
+@WHEELS@    float squared_rate; /* [(rad/s)^2] limit of what rate_form gives */
 } search;
 
 /* Lower bound of the clearance [rad] after a candidate; one below least is returned as it stands. */
@@ -405,7 +420,8 @@ static float squared_peak(const float omega_B[3])
 }
 
 /* Mix a torque with the brake's, as far as the rate limit needs it. */
-static void limit_rate(const body_state *body, const float brake_B[3], float torque_B[3])
+@NO_WHEELS@static void limit_rate(const body_state *body, const float brake_B[3], float torque_B[3])
+@WHEELS@static void limit_rate(const body_state *body, float squared_rate, const float brake_B[3], float torque_B[3])
 {
     body_state asked, braked;
     float change_B[3], slope_B[3], least, room, square, half, root, share;
@@ -433,6 +449,7 @@ static int passes(
     const search *at, float share, const float a_B[3], const float b_B[3], float least, float allowed_B[3])
 {
     const float slack = attitude_error + rate_error * KOZ_STEP_SECONDS;
+@WHEELS@    const float squared_rate = at->squared_rate;
     body_state after;
     float least_peak;
     int i;
@@ -448,14 +465,17 @@ static void allow(const koz_situation *now, const float requested_B[3], float al
 {
     search at;
     body_state after;
+@WHEELS@    float limit_B[3];
     float request_B[3], around_B[3], away_B[3], brake_B[3], momentum, braking, nearest, present, least;
     int i;
     at.now = now;
     at.body = body_of(now);
     at.present = unbounded;
-    for (i = 0; i < 3; i++) request_B[i] = larger(-@LIMIT_OF_I@, smaller(@LIMIT_OF_I@, requested_B[i]));
+@WHEELS@    at.squared_rate = squared_limit(now);
+@WHEELS@    koz_wheels_limits(now, limit_B);
+    for (i = 0; i < 3; i++) request_B[i] = larger(-@NOW_LIMIT_OF_I@, smaller(@NOW_LIMIT_OF_I@, requested_B[i]));
     brake(&at.body, brake_B);
-    limit_rate(&at.body, brake_B, request_B);
+    limit_rate(&at.body, @RATE_ARGUMENT@brake_B, request_B);
     if (passes(&at, 1.0f, request_B, request_B, shield_margin, allowed_B)) return;
 
     nearest = guide(now, &at.body, request_B, around_B, away_B);
@@ -483,8 +503,10 @@ void koz_shield(const koz_situation *now, const float requested_B[3], float allo
 {
     const koz_situation unit = koz_unit_situation(now);
     float found_B[3] = {0.0f, 0.0f, 0.0f};
+@WHEELS@    float limit_B[3];
     int i;
     if (koz_fault(now) == NULL) allow(&unit, requested_B, found_B);
+@WHEELS@    koz_wheels_limits(&unit, limit_B);
     /* No more than there is, not by rounding either. */
-    for (i = 0; i < 3; i++) allowed_B[i] = larger(-@LIMIT_OF_I@, smaller(@LIMIT_OF_I@, found_B[i]));
+    for (i = 0; i < 3; i++) allowed_B[i] = larger(-@NOW_LIMIT_OF_I@, smaller(@NOW_LIMIT_OF_I@, found_B[i]));
 }

@@ -25,11 +25,13 @@ extern "C" {
  * The torque [N m] to apply for KOZ_STEP_SECONDS in place of the requested one, of koz_torque or of anything else.
  * Uses attitude, rate and zones of the situation.  From states on that koz_is_safe accepts, the boresight stays out of
  * every zone, as long as errors are no larger than those above and the torque allowed here is the one applied.
+@WHEELS@ * Wheels can always brake up to the rate that it lets the body turn at, which depends on their momentum.
  * From others it leads out and away.  Zero where koz_fault finds one.  requested_B and allowed_B may be the same.
  */
 void koz_shield(const koz_situation *now, const float requested_B[3], float allowed_B[3]);
 
-/* Whether braking from here keeps the boresight outside all zones, with the margin. */
+@NO_WHEELS@/* Whether braking from here keeps the boresight outside all zones, with the margin. */
+@WHEELS@/* Whether wheels can brake from here, and that keeps the boresight outside all zones, with the margin. */
 int koz_is_safe(const koz_situation *now);
 
 #ifdef __cplusplus
