@@ -16,6 +16,7 @@ from koz_jax.control.shield import filter as shield
 from koz_jax.control.shield.filter import Shield
 from koz_jax.export.golden import Situation, directions, known, rows, situations
 from koz_jax.task import rotations, state
+from koz_jax.task.actuators import ReactionWheels
 from koz_jax.task.state import Model
 
 # Kinds of situations that are drawn in turn: as for the policy, slow at the edge of a zone, and slow inside it.
@@ -169,6 +170,9 @@ def _answer(
         limits = state.torque_limits(at, model)
         torque_B = jnp.clip(torque_B, -limits.box_B, limits.box_B)
         allowed_B = made.in_state(at, model).filter(at.body, torque_B, at.scenario.constraints, limits, model)
-        return jnp.clip(allowed_B, -limits.box_B, limits.box_B), made.covers(at, model)
+        if isinstance(model.actuators, ReactionWheels):
+            # Above the rate that they can stop, less may be left than the brake counts on.
+            allowed_B = jnp.clip(allowed_B, -limits.box_B, limits.box_B)
+        return allowed_B, made.covers(at, model)
 
     return jax.vmap(one)(drawn, requested)

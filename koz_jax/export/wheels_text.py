@@ -9,10 +9,11 @@ _LEFT = (
     " place of torque_limit. For a torque on the body they also give what H takes, w x H in the middle of the step"
 )
 _SEEN = (
-    " The same share is in reach, and rate_limit is of the largest rate that they can stop, or of max_rate_deg where"
-    " that is less: the least over the wheels of (max_momentum - |h - P H|) / |row of P|, less L, over c, or"
-    f" {2.0 * (1.0 - BRAKE_SHARE):g} R / (L + sqrt(L^2 + {2.0 * (1.0 - BRAKE_SHARE):g} (c - a) R)), with L = |I w + H|,"
-    " a and c the extreme moments of the inertia I, R the smallest torque_limit"
+    "So reach and rate_limit in the observation are no constants, and given for the start, at rest. The same share is"
+    " in reach; rate_limit is of the largest rate that they can stop, or of max_rate_deg where that is less: the least"
+    " over the wheels of (max_momentum - |h - P H|) / |row of P|, less L, over c, or 2 K /"
+    " (L + sqrt(L^2 + 2 (c - a) K)) where that is less, with L = |I w + H|, a and c the extreme moments of the inertia"
+    f" I, and K the smallest torque_limit times {1.0 - BRAKE_SHARE:g}"
 )
 
 
@@ -25,4 +26,4 @@ def meaning_of(wheels: Wheels, scaled: bool) -> str:
         f" {wheel.max_momentum:g} N m s"
         for wheel in wheels
     )
-    return f"Reaction wheels: {each}. {_LEFT}.{f'{_SEEN}.' if scaled else ''}"
+    return f"Reaction wheels: {each}. {_LEFT}.{f' {_SEEN}.' if scaled else ''}"
