@@ -169,19 +169,19 @@ def _steady(drawn: Situation, model: Model, count: int) -> Situation:
 
     Returns leaves (count, ...).
     """
-
-    @jax.jit
-    @jax.vmap
-    def seen(momentum: jax.Array, omega_BN_B: jax.Array) -> jax.Array:
-        largest = model.actuators.largest_rate(momentum, omega_BN_B, model.inertia_B)
-        assert largest is not None
-        return jnp.log(jnp.maximum(units.of(model).time * largest, FREE_RATE * LEAST_RATE))
-
     held = drawn.wheel_momentum
     assert held is not None
-    shifted = [seen((1.0 + shift) * held, drawn.omega_BN_B) for shift in (-_SHIFT, 0.0, _SHIFT)]
+    shifted = [_seen_rate((1.0 + shift) * held, drawn.omega_BN_B, model) for shift in (-_SHIFT, 0.0, _SHIFT)]
     kept = np.flatnonzero(np.ptp(shifted, axis=0) < _STEADY)[:count]
     return jax.tree.map(lambda leaf: leaf[kept], drawn)
+
+
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(0, 0, None))
+def _seen_rate(momentum: jax.Array, omega_BN_B: jax.Array, model: Model) -> jax.Array:
+    largest = model.actuators.largest_rate(momentum, omega_BN_B, model.inertia_B)
+    assert largest is not None
+    return jnp.log(jnp.maximum(units.of(model).time * largest, FREE_RATE * LEAST_RATE))
 
 
 def directions(rng: np.random.Generator, count: int, size: int) -> jax.Array:

@@ -31,7 +31,8 @@ pytestmark = [
 
 AGENT = spacecraft.agent()
 LEO = load_spacecraft(tiny.ROOT / "examples" / "leo_6u.toml").task
-TASK = LEO.model_copy(update={"spacecraft": LEO.spacecraft.model_copy(update={"max_rate_deg": 8.0})})
+BODY = LEO.spacecraft.model_copy(update={"max_rate_deg": 8.0})
+TASK = LEO.model_copy(update={"spacecraft": BODY, "episode_seconds": 15.0})
 SHIELD = ShieldConfig(error_bounds=UncertaintyConfig(inertia_error=0.05, rate_noise_deg=0.001))
 
 
