@@ -52,14 +52,16 @@ class CLibrary:
         self._declare()
 
     def _declare(self) -> None:
-        """Tell ctypes what the functions take; all but one return nothing."""
+        """Tell ctypes what the functions take; all but two return nothing."""
         pointers = {"start": 2, "observe": 3, "decide": 2, "torque": 3 if self._remembers else 2, "fault": 1}
-        pointers |= {"shield": 3} if self.has_shield else {}
+        pointers |= {"shield": 3, "is_safe": 1} if self.has_shield else {}
         pointers |= {"wheel_torques": 3} if self.wheels else {}
         for name, count in pointers.items():
             function = getattr(self._functions, f"koz_{name}")
             function.argtypes, function.restype = (ctypes.c_void_p,) * count, None
         self._functions.koz_fault.restype = ctypes.c_char_p
+        if self.has_shield:
+            self._functions.koz_is_safe.restype = ctypes.c_int
 
     def faults(self, situations: np.ndarray) -> list[str | None]:
         """What is wrong with each situation (batch, 11 + 4 zones): ``koz_situation`` field by field; None: nothing.
@@ -136,9 +138,23 @@ class CLibrary:
             SettingsError: it was exported without a shield, or an input has another shape.
 
         """
+        self._check_shield()
+        return self._answer_torques("koz_shield", situations, torques, ACTION_SIZE)
+
+    def is_safe(self, situations: np.ndarray) -> np.ndarray:
+        """Whether what the shield guarantees holds from situations on.  Returns (batch,) bool.
+
+        Raises:
+            SettingsError: it was exported without a shield, or an input has another shape.
+
+        """
+        self._check_shield()
+        told = self._situations(situations)
+        return np.array([bool(self._functions.koz_is_safe(row.ctypes.data)) for row in told], bool)
+
+    def _check_shield(self) -> None:
         if not self.has_shield:
             raise SettingsError("shield: this controller was exported without; --shield exports it")
-        return self._answer_torques("koz_shield", situations, torques, ACTION_SIZE)
 
     def _answer_torques(self, name: str, situations: np.ndarray, torques: np.ndarray, entries: int) -> np.ndarray:
         told, requested = self._situations(situations), _rows_of("torques", torques, ACTION_SIZE)

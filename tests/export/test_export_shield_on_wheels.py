@@ -55,14 +55,13 @@ def test_the_shield_decides_as_the_core_does(guarded):
 
     @jax.jit
     @functools.partial(jax.vmap, in_axes=(0, 0))
-    def expect(situation: Situation, torque_B: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def expect(situation: Situation, torque_B: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         at = situation.state(model, look_B)
         left_B = torque_limits(at, model).box_B
-        return left_B * jnp.clip(
-            made.allow(at, jnp.clip(torque_B / left_B, -1.0, 1.0), model).action, -1.0, 1.0
-        ), left_B
+        allowed = made.allow(at, jnp.clip(torque_B / left_B, -1.0, 1.0), model).action
+        return left_B * jnp.clip(allowed, -1.0, 1.0), left_B, made.covers(at, model)
 
-    expected, left = map(np.asarray, expect(drawn, box))
+    expected, left, safe = map(np.asarray, expect(drawn, box))
     found = library.shield(rows(drawn), box)
     passed = np.all(np.abs(expected - np.clip(box, -left, left)) < 1e-6 * limits, axis=1)
     # The same candidate, but for situations within rounding of a threshold.
@@ -72,9 +71,11 @@ def test_the_shield_decides_as_the_core_does(guarded):
         assert np.sum(~passed & there) > 20
         assert np.mean(same[there]) > 0.985 and np.mean(same[there & ~passed]) > 0.95
     assert np.sum(passed) > count // 20 and np.all(np.abs(found) <= left * (1 + 1e-5))
+    assert np.mean(library.is_safe(rows(drawn)) == safe) > 0.995 and 0.1 < np.mean(safe) < 0.9
     # With empty wheels it would decide otherwise.
     empty = rows(drawn).copy()
     empty[:, 15:] = 0.0
+    assert np.mean(library.is_safe(empty) != safe) > 0.05
     assert np.mean(np.any(np.abs(library.shield(empty, box) - expected) > 1e-3 * limits, axis=1)) > 0.1
 
 
