@@ -77,12 +77,12 @@ class Stage(abc.ABC):
         at_the_end = end == self.end > begin and (end - self.eval_from) % self.eval_every != 0
         return due(end) - due(begin) + at_the_end
 
-    def ends_early(self, state: RunState, evaluated: Mapping[str, float]) -> bool:
+    def ends_early(self, done: int, best_at: int, evaluated: Mapping[str, float]) -> bool:
         """Whether it, the last one, has just evaluated an agent that is its best and all that the run goes on until.
 
-        evaluated: the last row of the log, by the names of its columns.
+        best_at: when the best was taken; evaluated: the last row of the log, by the names of its columns.
         """
-        goals, is_best = self.config.until, self.start < int(state.best_at) == state.done
+        goals, is_best = self.config.until, self.start < best_at == done
         names = ("success_rate", "settling_time_mean", "control_effort_mean")
         outcome = [evaluated.get(f"eval/{name}", math.nan) for name in names]
         return bool(goals) and is_best and all(goal.is_met(*outcome) for goal in goals)

@@ -203,7 +203,7 @@ class _Run:
     def go(self, saved: Checkpoint, await_program: ahead.Await) -> Agent | None:
         """Train to the end, or until asked to stop."""
         state = saved.state
-        self.reached = self.stages[-1].ends_early(state, metrics_log.last_row(saved.log))
+        self.reached = self.stages[-1].ends_early(state.done, int(state.best_at), metrics_log.last_row(saved.log))
         if self._stage_at(state.done):
             with RunWriter(self.folder, self.config, saved) as out:
                 state = self._train(state, out, await_program)
@@ -260,7 +260,7 @@ class _Run:
             state = state.replace(best=best, best_score=jnp.float32(score), best_at=jnp.int32(done))
             out.agent(stage.agent, self._best_agent(state, stage))
         if stage is self.stages[-1]:
-            self.reached = processes.any_process(stage.ends_early(state, evaluated))
+            self.reached = processes.any_process(stage.ends_early(done, int(state.best_at), evaluated))
         return (self._hand_on(state, stage, out) if self.reached or done == stage.end else state), evaluated
 
     def _hand_on(self, state: RunState, stage: Stage, out: RunWriter) -> RunState:

@@ -1,7 +1,6 @@
 """The stages of a run: where they begin and end, what is the best of each, and what the next one begins from."""
 
 import signal
-from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -169,15 +168,14 @@ def test_a_stage_ends_early_only_by_its_best_agent_that_reaches_every_goal():
     stage = stages.plan(tiny.changed({"until": goals}))[-1]
     assert [str(goal) for goal in stage.config.until] == until
     done = stage.start + 2
-    best = SimpleNamespace(done=done, best_at=done)
-    assert stage.ends_early(best, _outcome(0.99, 20.0, 1e9))
-    assert not stage.ends_early(best, _outcome(0.9899, 20.0, 1.0))
-    assert not stage.ends_early(best, _outcome(1.0, 20.01, 1.0))
-    assert not stage.ends_early(best, _outcome(1.0, np.nan, 1.0))
-    assert not stage.ends_early(best, {})  # a row without an evaluation
-    assert not stage.ends_early(SimpleNamespace(done=done, best_at=done - 1), _outcome(1.0, 1.0, 1.0))
-    assert not stage.ends_early(SimpleNamespace(done=stage.start, best_at=stage.start), _outcome(1.0, 1.0, 1.0))
-    assert not stages.plan(CONFIG)[-1].ends_early(best, _outcome(1.0, 1.0, 1.0))  # without goals
+    assert stage.ends_early(done, done, _outcome(0.99, 20.0, 1e9))
+    assert not stage.ends_early(done, done, _outcome(0.9899, 20.0, 1.0))
+    assert not stage.ends_early(done, done, _outcome(1.0, 20.01, 1.0))
+    assert not stage.ends_early(done, done, _outcome(1.0, np.nan, 1.0))
+    assert not stage.ends_early(done, done, {})  # a row without an evaluation
+    assert not stage.ends_early(done, done - 1, _outcome(1.0, 1.0, 1.0))
+    assert not stage.ends_early(stage.start, stage.start, _outcome(1.0, 1.0, 1.0))
+    assert not stages.plan(CONFIG)[-1].ends_early(done, done, _outcome(1.0, 1.0, 1.0))  # without goals
 
 
 @pytest.mark.slow
