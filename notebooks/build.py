@@ -39,9 +39,11 @@ LEAST_DPI = 86.4
 # What a small budget puts in place of what a notebook says.
 _CHEAPER = {
     'preset("short")': 'preset("smoke")',
-    "cases=5_000": "cases=500",
-    "cases = 2_000": "cases = 500",
-    "cases=10_000": "cases=500",
+    "cases=500": "cases=100",
+    "cases=5_000": "cases=100",
+    "cases = 2_000": "cases = 100",
+    "cases=10_000": "cases=100",
+    "cases=200": "cases=100",
 }
 
 

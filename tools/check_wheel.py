@@ -22,7 +22,6 @@ COMMANDS = (
     "koz agents",
     "koz evaluate --cases 200",
     "koz train --preset smoke --cases 200 --run run",
-    "koz evaluate --agent run --cases 200 --shield",
     "koz fly --case 7 --out figures",
     "koz export phase2 --to c --out c",
     "koz view --out view.html",

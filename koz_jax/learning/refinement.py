@@ -17,7 +17,8 @@ import optax.contrib
 from flax import struct
 
 from koz_jax import devices
-from koz_jax.config.training import RefineConfig, TrainConfig
+from koz_jax.config.learners.refinement import RefineConfig
+from koz_jax.config.training import TrainConfig
 from koz_jax.control.policy import PolicyController
 from koz_jax.control.shield.filter import under_shield
 from koz_jax.learning.train_step import MAX_DRAWS, flight_errors

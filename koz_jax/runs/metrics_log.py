@@ -41,6 +41,12 @@ def flatten(prefix: str, tree: Any) -> dict[str, float]:
     return {f"{prefix}/" + "/".join(str(part).strip(".") for part in path): float(leaf) for path, leaf in leaves}
 
 
+def last_row(text: str) -> dict[str, float]:
+    """What the last row of ``metrics.csv`` holds, by the names of its columns; nothing where there is none."""
+    rows = [*csv.DictReader(text.splitlines())]
+    return {name: float(value) for name, value in rows[-1].items() if value} if rows else {}
+
+
 class MetricsLog:
     """Writes ``metrics.csv`` and TensorBoard events into a run folder.
 

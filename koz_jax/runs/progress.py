@@ -1,7 +1,6 @@
 """The progress bar of a training run, in time over all stages: what they took so far tells what they still take.
 
-Work that was not measured yet is set against what was, by ratios that hold roughly everywhere: one iteration of
-refinement costs as much as a hundred updates, an evaluation as much as an update for every 20 of its cases.
+Work that was not measured yet is set against what was, by what it costs on CPUs in transitions of gradient updates.
 """
 
 import dataclasses
@@ -17,14 +16,15 @@ from koz_jax.evaluation.summary import Summary
 from koz_jax.runs import stages
 from koz_jax.runs.stages import Refinement, Stage
 
-# Updates that take as long as an iteration of refinement over so many steps, as in the fast preset.
-_UPDATES_PER_ITERATION, _STEPS_PER_ITERATION = 100.0, 128 * 300
-_UPDATES_PER_CASE = 0.05
+# Transitions of a gradient update that take as long as a step of a maneuver in refinement, also where the gradient of
+# each maneuver is clipped by itself, and as a case of an evaluation.
+_PER_STEP, _PER_CLIPPED_STEP = 0.2, 0.33
+_PER_CASE = 100.0
 
 
 @dataclasses.dataclass
 class _Measured:
-    """What one kind of work took.  The first time includes compilation, and counts only while it is the only one."""
+    """What one kind of work took.  The first time includes compilation, and counts for little."""
 
     first: float = 0.0  # [s] of one
     seconds: float = 0.0
@@ -37,18 +37,20 @@ class _Measured:
             self.seconds += seconds
             self.count += count
 
-    @property
-    def each(self) -> float:
-        """[s] of one; 0 before there was any."""
-        return self.seconds / self.count if self.count else self.first
+    def each(self, guess: float) -> float:
+        """[s] of one.  guess: by other work, 0 where there was none; of it and a first time, the shorter is nearer."""
+        if self.count:
+            return self.seconds / self.count
+        return min(filter(None, (self.first, guess)), default=0.0)
 
 
 def weight(stage: Stage) -> float:
     """Updates that one update, or one iteration, of a stage costs as much as."""
     if not isinstance(stage, Refinement):
         return 1.0
-    steps = stage.config.refine.scenarios * stage.config.refine_steps
-    return _UPDATES_PER_ITERATION * steps / _STEPS_PER_ITERATION
+    config, refine = stage.config, stage.config.refine
+    per_step = _PER_CLIPPED_STEP if refine.max_maneuver_gradient else _PER_STEP
+    return per_step * refine.scenarios * config.refine_steps / config.sac.batch_size
 
 
 def work(planned: Sequence[Stage], done: int) -> float:
@@ -84,9 +86,11 @@ class TimeEstimate:
 
     @property
     def _per_update(self) -> float:
-        """[s] by the latest stage that was measured; 0 if none was."""
-        known = [self._stages[stage.title].each / weight(stage) for stage in self._planned]
-        return next(filter(None, reversed(known)), 0.0)
+        """[s] by the latest stage that was measured, more than once if there is one; 0 if none was."""
+        known = [(self._stages[stage.title], weight(stage)) for stage in reversed(self._planned)]
+        often = [measured.each(0.0) / weight for measured, weight in known if measured.count]
+        once = [measured.first / weight for measured, weight in known if measured.first]
+        return next(iter(often + once), 0.0)
 
     def _between(self, begin: int, end: int) -> float:
         """Time [s] from one count to another; in units of an update while nothing was measured."""
@@ -95,10 +99,10 @@ class TimeEstimate:
         for stage in self._planned:
             count = min(end, stage.end) - max(begin, stage.start)
             if count > 0:
-                total += count * (self._stages[stage.title].each or weight(stage) * per_update)
+                total += count * self._stages[stage.title].each(weight(stage) * per_update)
                 evaluations = stage.evaluations_between(max(begin, stage.start), min(end, stage.end))
-                guessed = _UPDATES_PER_CASE * stage.config.eval_cases * per_update
-                total += evaluations * (self._evaluation.each or guessed)
+                cases = _PER_CASE * stage.config.eval_cases / stage.config.sac.batch_size
+                total += evaluations * self._evaluation.each(cases * per_update)
         return total
 
 

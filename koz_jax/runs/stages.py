@@ -7,7 +7,8 @@ by what its best agent is chosen, and what it makes of the state that the stage 
 
 import abc
 import dataclasses
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -75,6 +76,16 @@ class Stage(abc.ABC):
 
         at_the_end = end == self.end > begin and (end - self.eval_from) % self.eval_every != 0
         return due(end) - due(begin) + at_the_end
+
+    def ends_early(self, done: int, best_at: int, evaluated: Mapping[str, float]) -> bool:
+        """Whether it, the last one, has just evaluated an agent that is its best and all that the run goes on until.
+
+        best_at: when the best was taken; evaluated: the last row of the log, by the names of its columns.
+        """
+        goals, is_best = self.config.until, self.start < best_at == done
+        names = ("success_rate", "settling_time_mean", "control_effort_mean")
+        outcome = [evaluated.get(f"eval/{name}", math.nan) for name in names]
+        return bool(goals) and is_best and all(goal.is_met(*outcome) for goal in goals)
 
     @property
     def improves_on_the_one_before(self) -> bool:

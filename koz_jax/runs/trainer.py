@@ -21,7 +21,7 @@ from koz_jax.errors import SettingsError
 from koz_jax.evaluation import cases
 from koz_jax.evaluation.summary import Summary, summarise
 from koz_jax.learning.finite_checks import NO_FAULT
-from koz_jax.runs import checkpoint, divergence, memory, provenance, sharding, stages
+from koz_jax.runs import checkpoint, divergence, memory, metrics_log, provenance, sharding, stages
 from koz_jax.runs.checkpoint import Checkpoint, RunState
 from koz_jax.runs.folder import RunFolder
 from koz_jax.runs.interrupt import GracefulShutdown
@@ -198,16 +198,19 @@ class _Run:
         self.stages = stages.plan(config)
         self.provenance = provenance.collect(config, command)
         self.warned = False  # that the critic diverges
+        self.reached = False  # what the run goes on until
 
     def go(self, saved: Checkpoint, await_program: ahead.Await) -> Agent | None:
         """Train to the end, or until asked to stop."""
         state = saved.state
-        if stages.after(self.stages, state.done) is not None:
+        self.reached = self.stages[-1].ends_early(state.done, int(state.best_at), metrics_log.last_row(saved.log))
+        if self._stage_at(state.done):
             with RunWriter(self.folder, self.config, saved) as out:
                 state = self._train(state, out, await_program)
-        if stages.after(self.stages, state.done) is not None:
-            return None
-        return self._best_agent(state, self.stages[-1])
+        return None if self._stage_at(state.done) else self._best_agent(state, self.stages[-1])
+
+    def _stage_at(self, done: int) -> Stage | None:
+        return None if self.reached else stages.after(self.stages, done)
 
     def _train(self, state: RunState, out: RunWriter, await_program: ahead.Await) -> RunState:
         """Go on chunk by chunk; log, evaluate and checkpoint on the way."""
@@ -218,7 +221,7 @@ class _Run:
         begun_at = stages.after(self.stages, done)
         if begun_at is not None and begun_at.improves_on_the_one_before and not np.isfinite(state.best_score):
             state, _ = self._evaluate(state, begun_at, out)  # what is refined must be improved on
-        while (stage := stages.after(self.stages, done)) and not processes.any_process(self.shutdown.requested):
+        while (stage := self._stage_at(done)) and not processes.any_process(self.shutdown.requested):
             await_program(type(stage).__name__)
             start = time.perf_counter()
             chunk = stage.advance(state, self.devices)
@@ -256,7 +259,9 @@ class _Run:
             best = jax.tree.map(jnp.copy, learner)
             state = state.replace(best=best, best_score=jnp.float32(score), best_at=jnp.int32(done))
             out.agent(stage.agent, self._best_agent(state, stage))
-        return (self._hand_on(state, stage, out) if done == stage.end else state), evaluated
+        if stage is self.stages[-1]:
+            self.reached = processes.any_process(stage.ends_early(done, int(state.best_at), evaluated))
+        return (self._hand_on(state, stage, out) if self.reached or done == stage.end else state), evaluated
 
     def _hand_on(self, state: RunState, stage: Stage, out: RunWriter) -> RunState:
         """End a stage: keep what others may start from, and begin the next one."""
@@ -266,6 +271,8 @@ class _Run:
             out.agent(stage.agent_at_end, self._best_agent(state, stage))
         if stage.improves_on_the_one_before:
             out.agent(stage.agent, self._best_agent(state, stage))  # which now tells how much was tried
+        if self.reached:
+            self.bar.note(f"{stage.title}: reached {', '.join(map(str, self.config.until))}")
         if stage.is_in_vain(int(state.best_at)):
             self.bar.note(f"{stage.title}: gave no better agent; kept the one of update {int(state.best_at)}")
         following = stages.after(self.stages, stage.end)

@@ -135,7 +135,7 @@ WITHOUT_MATPLOTLIB = (
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("argv", [["fly"], ["evaluate", "--figures", "out"], ["curves", "{run}", "--out", "out"]])
+@pytest.mark.parametrize("argv", [["evaluate", "--figures", "out"], ["curves", "{run}", "--out", "out"]])
 def test_without_matplotlib_the_error_says_what_to_install(argv, tmp_path):
     run = metrics_log(tmp_path / "run")
     told = [word.format(run=run) for word in argv]

@@ -316,7 +316,7 @@ def drive(stop_at: int, *argv: object) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the number of devices would not be the same")
-def test_a_run_ended_by_sigterm_and_resumed_equals_the_undisturbed_one(run, tmp_path):
+def test_a_run_ended_by_sigterm_and_resumed_equals_the_undisturbed_one(run, tmp_path, capsys):
     folder = RunFolder(tmp_path / "run")
     stopped = drive(48, "--run", folder.path, *tiny.FLAGS)
     assert (stopped.returncode, stopped.stdout) == (0, ""), stopped.stderr
@@ -326,8 +326,8 @@ def test_a_run_ended_by_sigterm_and_resumed_equals_the_undisturbed_one(run, tmp_
     assert json.loads((folder.checkpoints()[0] / "record.json").read_text())["done"] == 48
     assert folder.read_config() == run.read_config() == tiny.CONFIG
 
-    resumed = drive(-1, "--resume", folder.path, "--cases", tiny.CASES)
-    assert resumed.returncode == 0, resumed.stderr
+    assert tiny.status("train", "--resume", folder.path, "--cases", tiny.CASES) == 0
+    told = capsys.readouterr().out
     for saved in ("checkpoints/0000000136", "snapshots/phase1", "agents/phase1", "agents/phase2", "agents/phase2-sac"):
         with np.load(folder.path / saved / "arrays.npz") as found, np.load(run.path / saved / "arrays.npz") as expected:
             assert found.files == expected.files
@@ -336,8 +336,8 @@ def test_a_run_ended_by_sigterm_and_resumed_equals_the_undisturbed_one(run, tmp_
     assert (folder.path / "metrics.csv").read_bytes() == (run.path / "metrics.csv").read_bytes()
 
     # It ends with the table, its numbers as JSON, and a hint.
-    assert f"{tiny.CASES} cases" in resumed.stdout and "mean reward" in resumed.stdout
-    assert resumed.stdout.rstrip().endswith(f"python {tiny.ROOT / 'eval_mc.py'} --agent {folder.path} --csv cases.csv")
+    assert f"{tiny.CASES} cases" in told and "mean reward" in told
+    assert told.rstrip().endswith(f"koz evaluate --agent {folder.path} --csv cases.csv")
     evaluated = files.read_json(folder.evaluation)
     assert (evaluated["cases"], evaluated["agent"]) == (tiny.CASES, str(folder.path))
 

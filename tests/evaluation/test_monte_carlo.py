@@ -313,15 +313,6 @@ def test_two_processes_of_two_devices_give_the_results_of_one(single, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_folder_that_one_process_refuses_ends_in_all(tmp_path):
-    (tmp_path / "thesis.tex").write_text("years of work")
-    errors = tiny.ended(tiny.begin_two("eval_mc.py", "--cases", 600, "--partial", tmp_path), 2, 2)
-    assert "holds other things (thesis.tex)" in errors[0]
-    assert "processes: another process has failed" in errors[1]
-    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
-
-
-@pytest.mark.slow
 def test_processes_without_a_block_of_their_own_wait_for_the_others(tmp_path, capfd):
     tiny.ended(tiny.begin_two("eval_mc.py", "--cases", 5, "--partial", tmp_path / "kept"), 0, 0)
     assert capfd.readouterr().out.count("5 cases ") == 1
@@ -331,29 +322,6 @@ def test_processes_that_do_not_exist_are_refused(capsys):
     argv = ["--coordinator", "127.0.0.1:1", "--processes", 2, "--process", 2]
     assert tiny.status("eval_mc", *argv) == 2
     assert "process: must be from 0 to processes - 1 = 1, got 2" in capsys.readouterr().err
-
-
-# Flies cases on the devices that there are, and writes the results.
-FLY = """
-import sys, jax
-sys.path.insert(0, "..")
-import test_monte_carlo as test
-from koz_jax.evaluation import cases
-from koz_jax.storage import archive
-assert jax.local_device_count() == int(sys.argv[1])
-results = cases.fly_cases(test.AGENT.controller, test.AGENT.task, test.CONFIG)
-archive.save_tree(__import__("pathlib").Path(sys.argv[2]), results, {})
-"""
-
-
-@pytest.mark.slow
-def test_four_devices_give_the_results_of_one(single, tmp_path, monkeypatch):
-    assert jax.local_device_count() == 1
-    monkeypatch.chdir(tmp_path)
-    done = tiny.run_python("-c", FLY, 4, tmp_path / "results", cwd=HERE, variables=tiny.devices(4))
-    assert done.returncode == 0, done.stderr[-2000:]
-    shapes = jax.eval_shape(lambda: single)
-    assert_same(jax.tree.map(np.asarray, archive.load_tree(tmp_path / "results", shapes)), single)
 
 
 @pytest.mark.slow

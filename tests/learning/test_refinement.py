@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from koz_jax import devices
+from koz_jax.config.learners.refinement import RefineConfig
 from koz_jax.config.presets.named import preset
-from koz_jax.config.training import RefineConfig, TrainConfig
+from koz_jax.config.training import TrainConfig
 from koz_jax.control.policy import PolicyController, policy_network
 from koz_jax.learning import refinement
 from koz_jax.task import scenario

@@ -13,6 +13,7 @@ from koz_jax.runs.progress import Progress, TimeEstimate
 PLANNED = stages.plan(tiny.CONFIG)
 FIRST, SECOND, REFINE = PLANNED
 RATIO = progress.weight(REFINE)
+CASES = 100.0 * 12 / 16  # updates that an evaluation is guessed to cost
 
 
 class Clock:
@@ -34,8 +35,10 @@ def test_evaluations_are_counted_as_the_run_makes_them():
 
 
 def test_an_iteration_weighs_as_much_as_its_maneuvers():
-    """A hundred updates where it is 128 maneuvers of 300 steps, as in the fast preset."""
-    assert RATIO == pytest.approx(100.0 * (4 * 10) / (128 * 300))
+    """A step of one is a fifth of a transition, a third where each maneuver's gradient is clipped."""
+    assert RATIO == pytest.approx(0.2 * (4 * 10) / 16)
+    clipped = stages.plan(tiny.changed({"refine": {"max_maneuver_gradient": 0.1}}))[-1]
+    assert progress.weight(clipped) == pytest.approx(0.33 * (4 * 10) / 16)
     assert progress.weight(FIRST) == 1.0
     assert progress.work(PLANNED, 0) == 0.0
     assert progress.work(PLANNED, 136) == pytest.approx(128 + 8 * RATIO)
@@ -52,10 +55,12 @@ def test_what_was_measured_tells_what_is_left():
     assert estimate.left(32) == pytest.approx(96 * 0.5 + 8 * RATIO * 0.5 + 5 * 3.0)
     left = 96 * 0.5 + 8 * RATIO * 0.5 + 5 * 3.0
     assert estimate.share(32) == pytest.approx((32 * 0.5 + 3.0) / (32 * 0.5 + 3.0 + left))
-    # Each stage then tells by itself.
+    # Each stage then tells by itself, but not what it compiles at first.
+    estimate.computed(SECOND, 16, 160.0)
+    assert estimate.left(80) == pytest.approx(48 * 0.5 + 8 * RATIO * 0.5 + 4 * 3.0)
     estimate.computed(SECOND, 16, 16.0)
     estimate.computed(REFINE, 2, 50.0)
-    assert estimate.left(80) == pytest.approx(48 * 1.0 + 8 * 25.0 + 4 * 3.0)
+    assert estimate.left(80) == pytest.approx(48 * 1.0 + 8 * RATIO * 1.0 + 4 * 3.0)
     estimate.computed(REFINE, 2, 20.0)
     assert estimate.left(132) == pytest.approx(4 * 10.0 + 3.0)
     assert estimate.left(136) == 0.0 and estimate.share(136) == 1.0
@@ -80,7 +85,7 @@ def test_the_bar_of_a_whole_run_tells_the_time_that_it_takes(capsys):
                 spent += took["evaluation"]
                 bar.evaluated(PAPER_TABLE)
             told[done] = (bar.estimate.left(done), total - spent, bar.estimate.share(done))
-    for at in (130, 132, 136):  # the refinement has been met
+    for at in (132, 136):  # the refinement has been met
         assert told[at][0] == pytest.approx(told[at][1])
     assert told[132][2] == pytest.approx(1.0 - told[132][1] / total, abs=0.01)
     # Before, the share is behind the truth only by what the ratio of an iteration is off.
@@ -97,8 +102,8 @@ def test_a_resumed_run_begins_where_it_stopped(capsys):
         bar.compiling()
         clock.now += 30.0
         bar.advance(130)
-        assert bar.estimate.left(130) == pytest.approx(6 * 15.0 + 2 * 0.05 * 12 * 15.0 / RATIO)
+        assert bar.estimate.left(130) == pytest.approx(6 * 15.0 + 2 * CASES * 15.0 / RATIO)
         clock.now += 20.0
         bar.advance(132)
-        assert bar.estimate.left(132) == pytest.approx(4 * 10.0 + 0.05 * 12 * 10.0 / RATIO)
+        assert bar.estimate.left(132) == pytest.approx(4 * 10.0 + CASES * 10.0 / RATIO)
     assert "refine 4/8" in capsys.readouterr().err

@@ -31,26 +31,41 @@ def same_arrays(one: Path, other: Path) -> None:
             np.testing.assert_array_equal(found[name], expected[name], err_msg=name, strict=True)
 
 
+def await_training(*folders: RunFolder) -> None:
+    """Wait until runs train."""
+    deadline = time.monotonic() + 200
+    while not all((folder.path / "metrics.csv").exists() for folder in folders) and time.monotonic() < deadline:
+        time.sleep(0.01)
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="a worker could not be given a core of its own")
-def test_seeds_stopped_and_resumed_equal_single_runs_and_the_best_is_kept(tmp_path):
-    """Runs the command line: two seeds, ended by SIGTERM in their training, and gone on with."""
+def test_seeds_of_which_one_was_stopped_alone_are_resumed_equal_single_runs_and_the_best_is_kept(
+    tmp_path, monkeypatch, capsys
+):
+    """Two seeds; the worker of the first is told to stop in its training, and the run is gone on with."""
     alone = tiny.finished_run()  # seed 0
-    run = tmp_path / "run"
-    command = [sys.executable, tiny.ROOT / "train.py", *tiny.FLAGS, "--run", run, "--seeds", "2", "--cases", "12"]
-    with subprocess.Popen(list(map(str, command)), env=tiny.environment(), stderr=subprocess.PIPE) as process:
-        deadline = time.monotonic() + 300
-        while not (run / "seed-0" / "metrics.csv").exists() and time.monotonic() < deadline:
-            assert process.poll() is None
-            time.sleep(0.01)
-        process.send_signal(signal.SIGTERM)
-        _, errors = process.communicate()
-    assert process.returncode == 0, errors
-    assert "stopped; go on with" in errors.decode() and f"--resume {run}" in errors.decode()
+    run, workers = tmp_path / "run", []
+
+    class Noted(subprocess.Popen):
+        def communicate(self, input: Any = None, timeout: float | None = None) -> Any:
+            if input is not None and str(plan.folder(run, 0).path) in input:
+                workers.append(self)
+            return super().communicate(input, timeout)
+
+    monkeypatch.setattr(seeds.subprocess, "Popen", Noted)
+    plan = seeds.Plan(config=tiny.CONFIG, seeds=2, start_from=None)
+    seeds.begin(run, plan)
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        trained = pool.submit(seeds.train_all, run, plan, progress=False)
+        await_training(plan.folder(run, 0))
+        workers[0].terminate()
+        with pytest.raises(PeerProcessError, match="seed-0: was told to stop by somebody else; go on with"):
+            trained.result()
     assert not (run / "table.json").exists()
 
-    resumed = tiny.run_python(tiny.ROOT / "train.py", "--resume", run, "--cases", 12)
-    assert resumed.returncode == 0, resumed.stderr
+    assert tiny.status("train", "--resume", run, "--cases", 12) == 0
+    printed = capsys.readouterr().out
     assert (run / "seed-0" / "metrics.csv").read_bytes() == (alone.path / "metrics.csv").read_bytes()
     for name in ("checkpoints/0000000136", "agents/phase2"):
         same_arrays(run / "seed-0" / name, alone.path / name)
@@ -66,7 +81,38 @@ def test_seeds_stopped_and_resumed_equal_single_runs_and_the_best_is_kept(tmp_pa
         assert last.score(flown) == pytest.approx(scores[seed], rel=1e-5)
     assert load_agent(run).provenance == agents[table["best"]].provenance
     same_arrays(run / "agents" / "phase2", run / f"seed-{table['best']}" / "agents" / "phase2")
-    assert all(f"seed {seed} " in resumed.stdout for seed in scores) and resumed.stdout.count("  best") >= 1
+    assert all(f"seed {seed} " in printed for seed in scores) and printed.count("  best") >= 1
+
+
+# A worker that begins to train and goes on until it is told to stop.
+STUB = """
+import json, pathlib, signal, sys, time
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(75))
+folder = pathlib.Path(json.loads(sys.stdin.read())["run"])
+folder.mkdir(parents=True)
+(folder / "metrics.csv").write_text("updates")
+time.sleep(100)
+"""
+
+
+def test_sigterm_is_handed_on_to_all_workers(tmp_path, monkeypatch):
+    (tmp_path / "stub_of_a_worker.py").write_text(STUB)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(seeds, "_WORKER", "stub_of_a_worker")
+    plan = seeds.Plan(config=tiny.CONFIG, seeds=2, start_from=None)
+    folders = [plan.folder(tmp_path / "run", number) for number in range(min(2, len(os.sched_getaffinity(0))))]
+
+    def tell() -> None:
+        await_training(*folders)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    (tmp_path / "run").mkdir()
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        told = pool.submit(tell)
+        begun = time.monotonic()
+        assert seeds.train_all(tmp_path / "run", plan, progress=False) is False
+        told.result()
+    assert time.monotonic() - begun < 100
 
 
 def test_bad_numbers_of_seeds_and_used_folders_are_refused(tmp_path, capsys):
@@ -93,34 +139,6 @@ def test_a_beginning_that_cannot_be_leaves_nothing(tmp_path, capsys):
 LONG = seeds.Plan(config=tiny.changed({"log_every": 2, "eval_every": 2}), seeds=1, start_from=None)
 
 
-def await_training(run: Path) -> RunFolder:
-    """Wait until the only seed of a run trains."""
-    folder = LONG.folder(run, 0)
-    deadline = time.monotonic() + 200
-    while not (folder.path / "metrics.csv").exists() and time.monotonic() < deadline:
-        time.sleep(0.01)
-    return folder
-
-
-@pytest.mark.slow
-def test_a_worker_that_was_stopped_alone_is_no_finished_run(tmp_path, monkeypatch):
-    workers = []
-
-    class Noted(subprocess.Popen):
-        def __init__(self, *args: Any, **options: Any) -> None:
-            super().__init__(*args, **options)
-            workers.append(self)
-
-    monkeypatch.setattr(seeds.subprocess, "Popen", Noted)
-    seeds.begin(tmp_path / "run", LONG)
-    with concurrent.futures.ThreadPoolExecutor(1) as pool:
-        trained = pool.submit(seeds.train_all, tmp_path / "run", LONG, progress=False)
-        await_training(tmp_path / "run")
-        workers[0].terminate()
-        with pytest.raises(PeerProcessError, match="seed-0: was told to stop by somebody else; go on with"):
-            trained.result()
-
-
 TRAIN_ALL = """
 import sys, pathlib
 from koz_jax.runs import seeds, stages
@@ -134,7 +152,8 @@ def test_workers_stop_with_the_process_that_began_them(tmp_path):
     run = tmp_path / "run"
     seeds.begin(run, LONG)
     with subprocess.Popen([sys.executable, "-c", TRAIN_ALL, run], env=tiny.environment()) as process:
-        folder = await_training(run)
+        folder = LONG.folder(run, 0)
+        await_training(folder)
         process.kill()
     deadline = time.monotonic() + 60
     while True:  # until the worker has let go of its folder

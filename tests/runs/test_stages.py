@@ -14,6 +14,7 @@ from support.runs import assert_same_tree, signal_after, state_of
 from support.tiny import CONFIG
 
 from koz_jax.agents.agent import load_agent
+from koz_jax.config.goal import GoalConfig
 from koz_jax.evaluation.rollout import CaseResult
 from koz_jax.learning import train_step
 from koz_jax.runs import stages
@@ -154,3 +155,41 @@ def test_chunks_end_at_rows_of_the_log_evaluations_and_stages(phase1, phase2, it
         evaluated += [done] if stage.is_evaluated_at(done) else []
     assert ends == sorted((evaluations | logged) - {0})
     assert evaluated == sorted(evaluations)
+
+
+def _outcome(success: float, settling: float, effort: float) -> dict[str, float]:
+    names = ("success_rate", "settling_time_mean", "control_effort_mean")
+    return {f"eval/{name}": value for name, value in zip(names, (success, settling, effort), strict=True)}
+
+
+def test_a_stage_ends_early_only_by_its_best_agent_that_reaches_every_goal():
+    until = ["success=99", "settling=20"]
+    goals = [dict(zip(("quantity", "bound"), goal.split("="), strict=True)) for goal in until]
+    stage = stages.plan(tiny.changed({"until": goals}))[-1]
+    assert [str(goal) for goal in stage.config.until] == until
+    done = stage.start + 2
+    assert stage.ends_early(done, done, _outcome(0.99, 20.0, 1e9))
+    assert not stage.ends_early(done, done, _outcome(0.9899, 20.0, 1.0))
+    assert not stage.ends_early(done, done, _outcome(1.0, 20.01, 1.0))
+    assert not stage.ends_early(done, done, _outcome(1.0, np.nan, 1.0))
+    assert not stage.ends_early(done, done, {})  # a row without an evaluation
+    assert not stage.ends_early(done, done - 1, _outcome(1.0, 1.0, 1.0))
+    assert not stage.ends_early(stage.start, stage.start, _outcome(1.0, 1.0, 1.0))
+    assert not stages.plan(CONFIG)[-1].ends_early(done, done, _outcome(1.0, 1.0, 1.0))  # without goals
+
+
+@pytest.mark.slow
+def test_a_run_that_reached_its_goals_is_finished_and_stays_so(tmp_path, monkeypatch):
+    scores = iter([1.0, 1.0, 1.0, 1.0, 2.0])
+    monkeypatch.setattr(Stage, "score", lambda *_: next(scores))
+    monkeypatch.setattr(GoalConfig, "is_met", lambda *_: True)
+    config = tiny.changed({"until": [{"quantity": "success", "bound": 99.0}]})
+    folder = RunFolder(tmp_path / "run")
+    agent = train(config, folder.path, progress=False)
+    assert agent is not None and agent.provenance.refinements == config.refine_eval_every < config.refine.iterations
+    assert agent.provenance.refinements_tried == agent.provenance.refinements
+    log = (folder.path / "metrics.csv").read_bytes()
+    again = train(config, folder.path, resume=True, progress=False)  # no score is left to take
+    assert again is not None and again.provenance == agent.provenance
+    assert_same_tree(again.controller, agent.controller)
+    assert (folder.path / "metrics.csv").read_bytes() == log

@@ -33,7 +33,8 @@ SAC = Sac(
 GREEDY = 1e-8  # an entropy coefficient that does not matter, and stays so over a probe
 
 
-@functools.partial(jax.jit, static_argnums=0)
+# Thousands of updates, so that here it pays to optimise what is compiled; see ``conftest.py``.
+@functools.partial(jax.jit, static_argnums=0, compiler_options={"xla_backend_optimization_level": 2})
 def _learn(algorithm: Learner, batches: Batch, key: jax.Array, **begin: jax.Array) -> tuple[Any, LearnerMetrics]:
     key_init, key_updates = jax.random.split(key)
     rates = jnp.linspace(5e-3, 0.0, UPDATES)

@@ -16,6 +16,7 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 from koz_jax.config.actuators.gyros import GyroConfig
 from koz_jax.config.actuators.wheels import WheelConfig
 from koz_jax.config.base import Settings
+from koz_jax.config.goal import GoalConfig
 from koz_jax.errors import SettingsError, explain
 
 Flags = TypeVar("Flags", bound=Settings)
@@ -229,4 +230,18 @@ def _gyro(type_info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
         str_from_instance=lambda gyro: [
             str(number) for number in (*gyro.gimbal_axis, *gyro.rotor_axis, *list(gyro.model_dump().values())[2:])
         ],
+    )
+
+
+@_REGISTRY.primitive_rule
+def _goal(type_info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """A goal is QUANTITY=BOUND."""
+    if type_info.type is not GoalConfig:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="QUANTITY=BOUND",
+        instance_from_str=lambda words: dict(zip(GoalConfig.model_fields, words[0].split("=", 1), strict=False)),
+        is_instance=lambda instance: isinstance(instance, GoalConfig),
+        str_from_instance=lambda goal: [str(goal)],
     )

@@ -1,1 +1,1 @@
-"""Settings of the learners beside Soft Actor-Critic."""
+"""Settings of learners beside Soft Actor-Critic, and of refinement, which polishes what they have learned."""

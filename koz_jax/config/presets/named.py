@@ -2,13 +2,13 @@
 
 from koz_jax.config.base import constant
 from koz_jax.config.curriculum import CurriculumConfig, PhaseConfig
+from koz_jax.config.learners.refinement import RefineConfig
 from koz_jax.config.spread import SpreadConfig
 from koz_jax.config.task import TaskConfig
 from koz_jax.config.training import (
     NO_ENCODING,
     EncodingConfig,
     NetworkConfig,
-    RefineConfig,
     SacConfig,
     TrainConfig,
 )
