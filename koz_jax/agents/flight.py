@@ -41,7 +41,7 @@ def fly(
     """
     flying = load_for(maneuver, agent, urgency)
     if shield is not None:
-        shield.check(maneuver.task.spacecraft.torque_limits)
+        shield.check(maneuver.task.spacecraft.brake_limits)
     asked = MonteCarloConfig(seed=seed, shield=shield, substeps=substeps)
     config = maneuvers.config_of(maneuver, asked)
     return maneuvers.fly_closely(flying, maneuvers.scenario(maneuver), maneuver.task, config)

@@ -181,7 +181,7 @@ def _fly(case: str, maneuver: ManeuverConfig, flying: TaskController, by: str, u
     """Fly one maneuver."""
     shield = None if under is None else filter_named(under)
     if shield is not None:
-        shield.check(maneuver.task.spacecraft.torque_limits)
+        shield.check(maneuver.task.spacecraft.brake_limits)
     config = maneuvers.config_of(maneuver, MonteCarloConfig(shield=shield))
     flown = maneuvers.fly_closely(flying, maneuvers.scenario(maneuver), maneuver.task, config)
     report = flown.report()

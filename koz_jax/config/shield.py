@@ -12,7 +12,9 @@ from koz_jax.errors import SettingsError
 
 
 def check_disturbance(disturbance: float, torque_limits: Vector, what_for: str) -> None:
-    """Refuse a disturbance [N m] that a spacecraft has no torque for.  torque_limits: [N m] about each body axis.
+    """Refuse a disturbance [N m] that a spacecraft has no torque for.
+
+    torque_limits: [N m] about each body axis, that can be braked with.
 
     Raises:
         SettingsError: the disturbance is as strong.
@@ -69,7 +71,7 @@ class ShieldConfig(Settings):
     def check(self, torque_limits: Vector) -> None:
         """Refuse to withstand what a spacecraft has no torque for.
 
-        torque_limits: [N m] about each body axis.
+        torque_limits: [N m] about each body axis, that can be braked with.
 
         Raises:
             SettingsError: the disturbance is as strong.

@@ -66,6 +66,13 @@ class SpacecraftConfig(SettingsOfAgents):
         return limit if isinstance(limit, tuple) else (limit, limit, limit)
 
     @property
+    def brake_limits(self) -> Vector:
+        """Of that, what can be braked with at any rate [N m]; wheels need the rest for their own momentum."""
+        x, y, z = self.torque_limits
+        share = wheels.BRAKE_SHARE if self.wheels else 1.0
+        return share * x, share * y, share * z
+
+    @property
     def time_unit(self) -> float:
         """T = sqrt(J / u) [s], J a third of the inertia's trace, u the strength."""
         return float(np.sqrt(np.trace(np.array(self.inertia)) / 3.0 / self.strength))

@@ -198,7 +198,7 @@ class TrainConfig(Settings):
     @model_validator(mode="after")
     def _can_be_shielded(self) -> Self:
         if self.shielding.in_force:
-            self.shielding.in_force.check(self.task.spacecraft.torque_limits)
+            self.shielding.in_force.check(self.task.spacecraft.brake_limits)
         return self
 
     @model_validator(mode="after")

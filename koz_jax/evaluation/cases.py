@@ -89,7 +89,7 @@ def environment(task: TaskConfig, config: MonteCarloConfig) -> Reorientation:
     if config.uncertainty is not None:
         env = env.replace(uncertainty=uncertainty.from_config(config.uncertainty))
     if config.shield is not None:
-        config.shield.check(task.spacecraft.torque_limits)
+        config.shield.check(task.spacecraft.brake_limits)
     return under_filter(env, config.shield)
 
 

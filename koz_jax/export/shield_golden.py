@@ -78,7 +78,7 @@ def shield_golden(
 
     """
     limits = agent.task.spacecraft.torque_limits
-    config.check(limits)
+    config.check(agent.task.spacecraft.brake_limits)
     model, boresights_B = known(agent, further_boresights)
     made = shield.from_config(config, model)
     drawn, kind = shield_situations(agent, config, _DRAWN_PER_VECTOR * count, seed, further_boresights)

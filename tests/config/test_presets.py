@@ -198,7 +198,8 @@ def test_a_spacecraft_that_is_twice_as_slow_is_trained_over_the_same_steps(name)
 def test_sizes_of_a_gpu_leave_what_was_set_by_hand():
     fast = presets.preset("fast")
     sized, changed = sizes.for_gpu(fast)
-    assert sized.sac.batch_size > fast.sac.batch_size and sized.curriculum.updates < fast.curriculum.updates
+    assert sized.sac.batch_size > fast.sac.batch_size
+    assert sized.refine.scenarios > fast.refine.scenarios and sized.refine.iterations < fast.refine.iterations
     assert changed["sac.batch_size"] == sized.sac.batch_size
     by_hand = fast.model_copy(update={"num_envs": 64})
     again, changed = sizes.for_gpu(by_hand)

@@ -11,9 +11,11 @@ from koz_jax.config.actuators.wheels import WheelConfig
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import SpacecraftConfig, TaskConfig
+from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.control.adversarial import AnyAdversary
 from koz_jax.control.registry import load_controller
 from koz_jax.control.shield.filter import under_shield
+from koz_jax.errors import SettingsError
 from koz_jax.evaluation import cases, rollout
 from koz_jax.evaluation.rollout import History
 from koz_jax.task.environment import Reorientation
@@ -45,6 +47,21 @@ def _fly(controller: AnyAdversary, keys: jax.Array) -> tuple[History, jax.Array]
 def flown(name: str) -> tuple[History, np.ndarray]:
     history, margins = _fly(AnyAdversary.named(name), jax.random.split(jax.random.key(3), 40))
     return history, np.asarray(margins)
+
+
+def test_a_disturbance_that_wheels_have_no_torque_to_brake_against_is_refused():
+    """Half of their torque is for their own momentum, and does not count."""
+    weakest = min(TASK.spacecraft.torque_limits)
+    for share, refused in ((0.49, False), (0.51, True)):
+        config = MonteCarloConfig(
+            shield=ShieldConfig(error_bounds=UncertaintyConfig(disturbance_torque=share * weakest))
+        )
+        if refused:
+            with pytest.raises(SettingsError, match="disturbance_torque: must be below the torque limit of"):
+                cases.environment(TASK, config)
+        else:
+            made = cases.environment(TASK, config).action_filter
+            assert made is not None and made.brake.torque > 0.0
 
 
 @pytest.mark.slow

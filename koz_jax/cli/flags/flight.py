@@ -152,7 +152,7 @@ class FlightFlags(UncertaintyConfig, _RuleFlags, CaseConfig):
         changed = parsing.applied("task", task, self.task_changes)
         task = changed.with_rules(self.angle_convention, self.infeasible_zone, self.zones, self.max_rate_deg)
         if self.filter_config is not None:
-            self.filter_config.check(task.spacecraft.torque_limits)
+            self.filter_config.check(task.spacecraft.brake_limits)
         return task
 
     def label(self, agent: TaskController) -> str:

@@ -94,7 +94,7 @@ class OneCaseFlags(FlightFlags):
             return super().task(agent)
         task = self.own_maneuver.task.with_rules(self.angle_convention)
         if self.filter_config is not None:
-            self.filter_config.check(task.spacecraft.torque_limits)
+            self.filter_config.check(task.spacecraft.brake_limits)
         return task
 
     @property

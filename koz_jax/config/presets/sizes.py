@@ -1,7 +1,7 @@
 """Sizes of a training on a GPU, which takes as long for a small batch as for one many times larger.
 
-An update of 512 transitions counts for two of 256, and an iteration of refinement over a thousand maneuvers for
-several over a hundred; so there are fewer of them.
+An update of 512 transitions counts for more than one of 128, and an iteration of refinement over a thousand maneuvers
+for several over a hundred.  What a GPU trains was chosen and measured on one.
 """
 
 from collections.abc import Mapping
@@ -20,8 +20,10 @@ _FAST: Sizes = {
     "curriculum.phase1.updates": 20_000,
     "curriculum.phase1.learning_rate": ((0.0, 7e-4),),
     "curriculum.phase2.updates": 60_000,
+    "curriculum.phase2.effort_weight": ((0.0, 0.0), (0.1, 0.2), (0.5, 1.0)),
     "curriculum.phase2.learning_rate": ((0.0, 7e-4), (0.5, 7e-4), (1.0, 3.5e-5)),
     "refine.scenarios": 1024,
+    "refine.horizon_seconds": 30.0,
     "refine.iterations": 150,
     "refine.learning_rate": 2e-3,
     "eval_every": 20_000,
