@@ -14,7 +14,8 @@ _QUICK = ["--xla_backend_optimization_level=0"]
 if version("jaxlib").startswith("0.10."):  # others end a process at the name of a flag that they do not know
     _QUICK.append("--xla_cpu_use_fusion_emitters=false")
 if os.environ["JAX_PLATFORMS"] == "cpu":
-    os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *_QUICK])
+    # Each once: what is compiled is kept by its flags as they are written.
+    os.environ["XLA_FLAGS"] = " ".join(dict.fromkeys([*os.environ.get("XLA_FLAGS", "").split(), *_QUICK]))
 
 import jax
 import pytest

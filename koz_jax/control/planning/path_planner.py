@@ -36,11 +36,15 @@ class _Found(struct.PyTreeNode):
 
 
 class PathPlanner(PathTracker):
-    """Plans in ``begin``, and is otherwise a ``PathTracker``, whose gains are tuned for it."""
+    """Bends the eigen-axis turn, and is otherwise a ``PathTracker``, whose gains are tuned for it."""
 
     sines: int = struct.field(pytree_node=False, default=2)  # of the bend
-    candidates: int = struct.field(pytree_node=False, default=32)  # of a round of refinement
+    candidates: int = struct.field(pytree_node=False, default=32)  # of a round, or as many as there are first bends
     rounds: int = struct.field(pytree_node=False, default=16)
+
+    def staying(self, state: EnvState) -> AttitudePath:
+        """No turn."""
+        return AttitudePath(state.body.q_BN, jnp.zeros(3), jnp.zeros((self.sines, 3)))
 
     def search(self, state: EnvState, model: Model, key: jax.Array) -> tuple[AttitudePath, Timing]:
         """Search for the fastest bend that keeps its distance."""
@@ -57,23 +61,26 @@ class PathPlanner(PathTracker):
     def _refined(self, cost: Callable[[jax.Array], jax.Array], first_B: jax.Array, key: jax.Array) -> jax.Array:
         """Cross-entropy search from the best of the first bends (n, sines, 3).  Returns the best found (sines, 3)."""
         order = 1.0 / jnp.arange(1.0, self.sines + 1)[None, :, None]
-        elite = max(self.candidates // 4, 1)
+        elite = max(len(first_B) // 4, 1)
         weights = jnp.log(elite + 0.5) - jnp.log(jnp.arange(1.0, elite + 1))
 
-        def refine(found: _Found, draw: tuple[jax.Array, jax.Array]) -> tuple[_Found, None]:
-            key_round, spread = draw
-            changes_B = spread * order * jax.random.normal(key_round, (self.candidates, self.sines, 3))
-            tried_B = (found.mean_B[None] + changes_B).at[0].set(found.best_B)
+        def refine(found: _Found, draw: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[_Found, None]:
+            key_round, spread, is_first = draw
+            changes_B = spread * order * jax.random.normal(key_round, first_B.shape)
+            around_B = (found.mean_B[None] + changes_B).at[0].set(found.best_B)
+            tried_B = jnp.where(is_first, first_B, around_B)
             best_first = tried_B[jnp.argsort(jax.vmap(cost)(tried_B))]
             mean_B = jnp.tensordot(weights / jnp.sum(weights), best_first[:elite], axes=1)
-            return _Found(mean_B, best_first[0]), None
+            return _Found(jnp.where(is_first, best_first[0], mean_B), best_first[0]), None
 
-        begin_B = first_B[jnp.argmin(jax.vmap(cost)(first_B))]
-        draws = (jax.random.split(key, self.rounds), jnp.geomspace(*_SPREADS, self.rounds))
-        return jax.lax.scan(refine, _Found(begin_B, begin_B), draws)[0].best_B
+        # The first bends are a round like the others, so that what a path costs is in the program once.
+        keys = jnp.concatenate([key[None], jax.random.split(key, self.rounds)])
+        spreads = jnp.concatenate([jnp.zeros(1), jnp.geomspace(*_SPREADS, self.rounds)])
+        draws = (keys, spreads, jnp.arange(self.rounds + 1) == 0)
+        return jax.lax.scan(refine, _Found(first_B[0], first_B[0]), draws)[0].best_B
 
     def _first_bends(self, state: EnvState) -> jax.Array:
-        """Bends to all sides, by several angles.  Returns (..., sines, 3) [rad]."""
+        """Bends to all sides, by several angles; again, where a round has more.  Returns (n, sines, 3) [rad]."""
         straight = attitude_path.from_state(state.body, state.scenario.q_DN, jnp.zeros((self.sines, 3)))
         half_way = feedback.from_rotation_vector(-0.5 * straight.turn_B)
         look_B = rotations.rotate(half_way, state.scenario.constraints.boresight_B[0])
@@ -85,4 +92,5 @@ class PathPlanner(PathTracker):
         axes_B = jnp.cos(sides)[:, None] * square_B[None] + jnp.sin(sides)[:, None] * across_B[None]
         bends_B = (jnp.deg2rad(jnp.array(_BENDS_DEG))[:, None, None] * axes_B[None]).reshape(-1, 1, 3)
         rest = jnp.zeros((bends_B.shape[0], self.sines - 1, 3))
-        return jnp.concatenate([bends_B, rest], axis=1)
+        count = max(self.candidates, len(bends_B))
+        return jnp.resize(jnp.concatenate([bends_B, rest], axis=1), (count, self.sines, 3))

@@ -1,4 +1,4 @@
-"""Planners search for a path before the maneuver; this is what they share: its timing, what it costs, its tracking."""
+"""What planners share, which search for a path in their first decision: its timing, what it costs, its tracking."""
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,7 @@ class Plan(struct.PyTreeNode):
     timing: Timing
     clock: jax.Array  # () [s] of the plan; stands still while the body is too far from it
     key: jax.Array  # () typed PRNG key of the next search
+    found: jax.Array  # () bool, false before the first search
 
     def reference(self, time: jax.Array, pace: jax.Array) -> RigidBodyState:
         """Where the body should be at a time () [s] of the plan whose clock goes at a pace ()."""
@@ -61,7 +62,7 @@ def _max_speed(samples: Samples, state: EnvState, model: Model) -> jax.Array | N
 
 
 class PathTracker(struct.PyTreeNode):
-    """Base of planners: has a path made in ``begin``, tracks it in ``decide``, and anew where the body has left it.
+    """Base of planners: has a path made in the first decision, tracks it, and has one made anew where the body left it.
 
     The tracking error decays with ``bandwidth``, its rate with ``rate_bandwidth``.
     """
@@ -75,15 +76,24 @@ class PathTracker(struct.PyTreeNode):
     patience: Gain = 0.0425  # () [rad] tracking error at which the plan waits
     points: int = struct.field(pytree_node=False, default=49)  # at which a path is timed
 
+    def staying(self, state: EnvState) -> Path:
+        """Make a path of the kind that ``search`` finds, but one that stays where it begins."""
+        raise NotImplementedError
+
     def search(self, state: EnvState, model: Model, key: jax.Array) -> tuple[Path, Timing]:
         """Find a path from the state to its target, and time it.  key: () typed PRNG key."""
         raise NotImplementedError
 
     def begin(self, state: EnvState, model: Model, key: jax.Array) -> Plan:
+        """Make a plan that is none yet: there is one search in the program, that of ``decide``."""
+        timing = Timing(jnp.zeros(self.points), jnp.zeros(self.points))
+        return Plan(self.staying(state), timing, jnp.zeros(()), key, jnp.array(False))
+
+    def planned(self, state: EnvState, model: Model, key: jax.Array) -> Plan:
         """Search for a path from the state to its target."""
         key, key_search = jax.random.split(key)
         path, timing = self.search(state, model, key_search)
-        return Plan(path, timing, jnp.zeros(()), key)
+        return Plan(path, timing, jnp.zeros(()), key, jnp.array(True))
 
     def timed(self, path: Path, state: EnvState, model: Model) -> tuple[Samples, Timing]:
         """Sample a path, and time it as fast as the spacecraft can follow."""
@@ -115,13 +125,13 @@ class PathTracker(struct.PyTreeNode):
         return action, plan.replace(clock=plan.clock + pace * dt)
 
     def _not_lost(self, state: EnvState, model: Model, plan: Plan) -> Plan:
-        """The plan, or a new one from here where the body is too far from it."""
-        lost = rotations.norm(plan.error(state.body)) > _LOST * self.patience
+        """The plan, or a new one from here where there is none, or the body is too far from it."""
+        lost = ~plan.found | (rotations.norm(plan.error(state.body)) > _LOST * self.patience)
 
         def anew(search: _Search) -> _Search:
             # Without the barrier the search is done in advance, at every step, as it does not depend on the loop.
             search, here = jax.lax.optimization_barrier((search, state))
-            return _Search(self.begin(here, model, search.plan.key), jnp.array(False))
+            return _Search(self.planned(here, model, search.plan.key), jnp.array(False))
 
         # A loop, not a branch: a batch then plans only when one of it is lost.
         return jax.lax.while_loop(lambda search: search.needed, anew, _Search(plan, lost)).plan

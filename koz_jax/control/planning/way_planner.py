@@ -25,6 +25,10 @@ class WayPlanner(PathTracker):
         """
         raise NotImplementedError
 
+    def staying(self, state: EnvState) -> SplinePath:
+        """No turn."""
+        return spline_path.along(jnp.tile(state.body.q_BN, (self.points, 1)))
+
     def search(self, state: EnvState, model: Model, key: jax.Array) -> tuple[SplinePath, Timing]:
         """Search for a way, and smooth it."""
         return self.smoothed(self.way(state, model, key), state, model)

@@ -38,7 +38,7 @@ def drawn():
 @jax.jit
 def _plan(drawn, model):
     def plan(case, key):
-        return PLANNER.begin(begin(case, model), model, key)
+        return PLANNER.planned(begin(case, model), model, key)
 
     return jax.vmap(plan)(drawn, jax.random.split(jax.random.key(1), COUNT))
 
