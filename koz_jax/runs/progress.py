@@ -18,7 +18,7 @@ from koz_jax.runs.stages import Refinement, Stage
 
 # Transitions of a gradient update that take as long as a step of a maneuver in refinement, also where the gradient of
 # each maneuver is clipped by itself, and as a case of an evaluation.
-_PER_STEP, _PER_CLIPPED_STEP = 0.2, 0.33
+_PER_STEP, _PER_CLIPPED_STEP = 0.35, 0.5
 _PER_CASE = 100.0
 
 

@@ -271,7 +271,8 @@ def test_the_command_keeps_blocks(tmp_path, capsys, monkeypatch):
     assert "partial: is not written with --replay-case" in capsys.readouterr().err
 
 
-# Flies blocks of cases together with another process, and writes the results.
+# Flies blocks of cases together with another process, then fewer than a block, for which one of them waits; and writes
+# the results.
 JOIN = """
 import sys, pathlib
 sys.path.insert(0, "..")
@@ -286,6 +287,9 @@ flown = monte_carlo.run_cases(
     test.AGENT, test.AGENT.task, test.CONFIG, partial=folder / "kept", block=test.BLOCK
 )
 archive.save_tree(folder / sys.argv[2], flown.results, {"compiled": flown.compile_s > 0})
+few = test.CONFIG.model_copy(update={"cases": test.BLOCK})
+flown = monte_carlo.run_cases(test.AGENT, test.AGENT.task, few, partial=folder / "few", block=test.BLOCK)
+archive.save_tree(folder / f"few{sys.argv[2]}", flown.results, {})
 """
 
 
@@ -308,14 +312,11 @@ def test_two_processes_of_two_devices_give_the_results_of_one(single, tmp_path):
     shapes = jax.eval_shape(lambda: single)
     for number in range(2):
         assert_same(jax.tree.map(np.asarray, archive.load_tree(tmp_path / str(number), shapes)), single)
+        few = jax.tree.map(lambda leaf: leaf[:BLOCK], single)
+        found = archive.load_tree(tmp_path / f"few{number}", jax.eval_shape(lambda few=few: few))
+        assert_same(jax.tree.map(np.asarray, found), few)
     names = {path.name for path in (tmp_path / "kept").iterdir()}
     assert names == {"lock", *(f"block-{first:010d}" for first in (0, 1000, 2000))}
-
-
-@pytest.mark.slow
-def test_processes_without_a_block_of_their_own_wait_for_the_others(tmp_path, capfd):
-    tiny.ended(tiny.begin_two("eval_mc.py", "--cases", 5, "--partial", tmp_path / "kept"), 0, 0)
-    assert capfd.readouterr().out.count("5 cases ") == 1
 
 
 def test_processes_that_do_not_exist_are_refused(capsys):

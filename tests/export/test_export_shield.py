@@ -144,17 +144,6 @@ def test_it_decides_as_the_core_does_where_cones_turn(agent, tmp_path):
     assert done.returncode == 0 and done.stdout.count("passed") == 2, done.stdout + done.stderr
 
 
-@pytest.mark.slow
-def test_it_decides_as_the_core_does_on_a_cubesat(agent, tmp_path):
-    inertia = ((0.05, 0.0, 0.0), (0.0, 0.06, 0.0), (0.0, 0.0, 0.02))
-    other = of_the_task(agent, inertia=inertia, torque_limit=0.004, boresight=(0.0, 0.0, 1.0))
-    other = dataclasses.replace(other, task=other.task.model_copy(update={"step_seconds": 0.2}))
-    write_files(tmp_path, export(other, "c", CONFIG))
-    check_alike(other, CLibrary(tmp_path))
-    done = tiny.make_test(tmp_path)
-    assert done.returncode == 0, done.stdout + done.stderr
-
-
 @pytest.mark.parametrize("config", [CONFIG, ROBUST], ids=["plain", "robust"])
 def test_golden_vectors_are_of_every_kind(agent, config):
     drawn = shield_golden(agent, config, 100)

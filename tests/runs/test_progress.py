@@ -35,10 +35,10 @@ def test_evaluations_are_counted_as_the_run_makes_them():
 
 
 def test_an_iteration_weighs_as_much_as_its_maneuvers():
-    """A step of one is a fifth of a transition, a third where each maneuver's gradient is clipped."""
-    assert RATIO == pytest.approx(0.2 * (4 * 10) / 16)
+    """A step of one is a third of a transition, half where each maneuver's gradient is clipped."""
+    assert RATIO == pytest.approx(0.35 * (4 * 10) / 16)
     clipped = stages.plan(tiny.changed({"refine": {"max_maneuver_gradient": 0.1}}))[-1]
-    assert progress.weight(clipped) == pytest.approx(0.33 * (4 * 10) / 16)
+    assert progress.weight(clipped) == pytest.approx(0.5 * (4 * 10) / 16)
     assert progress.weight(FIRST) == 1.0
     assert progress.work(PLANNED, 0) == 0.0
     assert progress.work(PLANNED, 136) == pytest.approx(128 + 8 * RATIO)
