@@ -14,7 +14,7 @@ from koz_jax.config.task import SpacecraftConfig, TaskConfig
 from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.control.adversarial import AnyAdversary
 from koz_jax.control.registry import load_controller
-from koz_jax.control.shield.filter import under_shield
+from koz_jax.control.shield.filter import Shield, under_shield
 from koz_jax.errors import SettingsError
 from koz_jax.evaluation import cases, rollout
 from koz_jax.evaluation.rollout import History
@@ -61,7 +61,7 @@ def test_a_disturbance_that_wheels_have_no_torque_to_brake_against_is_refused():
                 cases.environment(TASK, config)
         else:
             made = cases.environment(TASK, config).action_filter
-            assert made is not None and made.brake.torque > 0.0
+            assert isinstance(made, Shield) and made.brake.torque > 0.0
 
 
 @pytest.mark.slow
