@@ -96,11 +96,31 @@ def _fast() -> TrainConfig:
     )
 
 
-def _thorough() -> TrainConfig:
-    """The fast preset with five times its refinement, over twice as many maneuvers."""
+def _longer(updates1: int, updates2: int) -> TrainConfig:
+    """The fast preset with so many updates of larger batches in both phases, and effort weighed in earlier."""
     fast = _fast()
-    longer = fast.refine.model_copy(update={"iterations": 2000, "scenarios": 256})
-    return fast.model_copy(update={"preset": "thorough", "refine": longer, "eval_cases": 4000})
+    phase1, phase2 = fast.curriculum.phase1, fast.curriculum.phase2
+    weighed = {
+        "updates": updates2,
+        "effort_weight": ((0.0, 0.0), (0.1, 0.2), (0.5, 1.0)),
+        "learning_rate": ((0.0, 5e-4), (0.5, 5e-4), (1.0, 2.5e-5)),
+    }
+    return fast.model_copy(
+        update={
+            "sac": fast.sac.model_copy(update={"batch_size": 256}),
+            "curriculum": CurriculumConfig(
+                phase1=phase1.model_copy(update={"updates": updates1, "learning_rate": constant(5e-4)}),
+                phase2=phase2.model_copy(update=weighed),
+            ),
+            "eval_every": 10_000,
+        }
+    )
+
+
+def _thorough() -> TrainConfig:
+    """The shipped agents of the paper's spacecraft come from it."""
+    refine = RefineConfig(iterations=3000, scenarios=256)
+    return _longer(40_000, 360_000).model_copy(update={"preset": "thorough", "refine": refine, "eval_cases": 4000})
 
 
 # An agent for any spacecraft draws another one for every maneuver, with instruments, rate limit and urgency.
@@ -120,18 +140,7 @@ _ANY = SpreadConfig(
 
 def _universal() -> TrainConfig:
     """An agent for any spacecraft, by far the longest training: sized for a GPU, hours on a CPU."""
-    fast = _fast()
-    phases = fast.curriculum
-    longer = CurriculumConfig(
-        phase1=phases.phase1.model_copy(update={"updates": 32_000, "learning_rate": constant(5e-4)}),
-        phase2=phases.phase2.model_copy(
-            update={
-                "updates": 64_000,
-                "effort_weight": ((0.0, 0.0), (0.1, 0.2), (0.5, 1.0)),
-                "learning_rate": ((0.0, 5e-4), (0.5, 5e-4), (1.0, 2.5e-5)),
-            }
-        ),
-    )
+    longer = _longer(32_000, 64_000)
     refine = {
         "horizon_seconds": 45.0,
         "optimizer": "muon",
@@ -146,12 +155,9 @@ def _universal() -> TrainConfig:
         "scenarios": 96,
         "iterations": 7000,
     }
-    return fast.model_copy(
+    return longer.model_copy(
         update={
             "preset": "universal",
-            "curriculum": longer,
-            "sac": fast.sac.model_copy(update={"batch_size": 256}),
-            "eval_every": 10_000,
             "task": TaskConfig(spread=_ANY),
             "eval_cases": 400,
             "refine_eval_every": 500,
@@ -161,7 +167,7 @@ def _universal() -> TrainConfig:
                 observed_zones=4,
                 scaled=True,
             ),
-            "refine": fast.refine.model_copy(update=refine),
+            "refine": longer.refine.model_copy(update=refine),
         }
     )
 
