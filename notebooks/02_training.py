@@ -1,7 +1,7 @@
 # %% [markdown]
 # # 2. Training
 #
-# An agent learns the maneuver in two or three minutes on two CPU cores: first turning (phase 1), then turning around
+# An agent learns the maneuver in some minutes on a CPU core: first turning (phase 1), then turning around
 # the zone (phase 2), then a polish by gradients through the dynamics. `koz train` does the same with more of
 # everything.
 
@@ -22,7 +22,7 @@ runtime.configure()  # all cores; compiled programs are kept for the next time
 
 # %% [markdown]
 # ## Settings
-# A preset is a validated, immutable object: `short` takes two minutes, `fast` five, and `thorough` makes the shipped
+# A preset is a validated, immutable object: `short` takes half of the time of `fast`, and `thorough` makes the shipped
 # agents. To change one, change its content and validate again.
 
 # %%
