@@ -95,12 +95,13 @@ time.sleep(100)
 """
 
 
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="how many workers there are is not known")
 def test_sigterm_is_handed_on_to_all_workers(tmp_path, monkeypatch):
     (tmp_path / "stub_of_a_worker.py").write_text(STUB)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(seeds, "_WORKER", "stub_of_a_worker")
     plan = seeds.Plan(config=tiny.CONFIG, seeds=2, start_from=None)
-    folders = [plan.folder(tmp_path / "run", number) for number in range(min(2, len(os.sched_getaffinity(0))))]
+    folders = [plan.folder(tmp_path / "run", number) for number in range(min(plan.seeds, len(os.sched_getaffinity(0))))]
 
     def tell() -> None:
         await_training(*folders)
