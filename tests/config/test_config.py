@@ -67,7 +67,7 @@ BAD = [
     ("network.hidden_sizes", (128, 0), ["greater than 0", "0"]),
     ("network.encoding.rate_scales", (0.1, -0.1), ["greater than 0", "-0.1"]),
     ("sac.batch_size", 512_001, ["at most sac.buffer_size", "512001", "512000"]),
-    ("sac.buffer_size", 100, ["sac.batch_size", "256", "100"]),
+    ("sac.buffer_size", 100, ["sac.batch_size", "128", "100"]),
     ("sac.n_step", 1001, ["sac.buffer_size", "num_envs = 512", "n_step = 1001"]),
     ("sac.reward_scale", float("nan"), ["finite", "nan"]),
     ("sac.soft_update", 1.5, ["less than or equal to 1", "1.5"]),

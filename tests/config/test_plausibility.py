@@ -69,8 +69,9 @@ def test_a_body_that_manages_only_some_turns_is_warned_of(caplog):
 
 
 def test_a_training_episode_that_is_too_short_for_the_body_is_warned_of(caplog):
-    """The body turns by 180 deg in 34 s: episodes of 100 s and of 40 s hold that, the refinement's 30 s do not."""
-    slow = preset("fast").model_copy(update={"task": task(inertia=INERTIA, torque_limit=0.75)})
+    """The body turns by 180 deg in 34 s: episodes of 100 s and of 40 s hold that, a refinement of 30 s does not."""
+    refine = preset("fast").refine.model_copy(update={"horizon_seconds": 30.0})
+    slow = preset("fast").model_copy(update={"task": task(inertia=INERTIA, torque_limit=0.75), "refine": refine})
     with caplog.at_level(logging.WARNING):
         plausibility.check_training(slow)
     (record,) = caplog.records
