@@ -24,7 +24,7 @@ from koz_jax.agents.record import Provenance
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.presets.named import preset
 from koz_jax.config.task import TaskConfig
-from koz_jax.config.training import NetworkConfig
+from koz_jax.config.training import NetworkConfig, TrainConfig
 from koz_jax.control.policy import PolicyController, policy_network
 from koz_jax.evaluation.monte_carlo import run_cases
 from koz_jax.learning import learners
@@ -151,8 +151,10 @@ def update_matmuls(sac: learner.Sac, batch: int) -> list[Shape]:
     return target + critics + actor
 
 
-def update(name: str, sac: learner.Sac, batch_size: int, rate: float) -> None:
+def update(config: TrainConfig, rate: float) -> None:
     """One gradient update against the products it is made of, each timed alone in its own shape."""
+    sac, batch_size = learners.make_sac(config), config.sac.batch_size
+    name = f"{config.preset} ({'-'.join(map(str, config.network.hidden_sizes))}, batch {batch_size})"
     shape = (UPDATES, batch_size)
     key = jax.random.key(0)
     observed = jax.random.normal(key, (*shape, sac.observation_size))
@@ -206,9 +208,8 @@ def main() -> None:
     for hidden in (256, 64):
         monte_carlo(hidden, rate)
     environment()
-    paper, fast = preset("paper"), preset("fast")
-    update("paper (256-256, batch 256)", learners.make_sac(paper), paper.sac.batch_size, rate)
-    update("fast (128-128, batch 256)", learners.make_sac(fast), fast.sac.batch_size, rate)
+    update(preset("paper"), rate)
+    update(preset("fast"), rate)
     first_update()
 
 

@@ -72,7 +72,7 @@ after = monte_carlo(agent, cases=cases)
 print(table(after, name="my agent"))
 
 # %% [markdown]
-# A training of two minutes is short: `preset("fast")` and `preset("thorough")` train longer, `preset("universal")` for
+# That was a short training: `preset("fast")` and `preset("thorough")` train longer, `preset("universal")` for
 # all spacecraft. What is left of cases that look into a zone is what the shield is for:
 # `monte_carlo(agent, task=mine, shield=ShieldConfig())`.
 

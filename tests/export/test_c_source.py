@@ -5,7 +5,6 @@ import os
 import re
 import shutil
 import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -39,16 +38,9 @@ def agent() -> Agent:
 
 
 @pytest.fixture(scope="module")
-def folder(agent, tmp_path_factory) -> Path:
+def exported(agent) -> dict[str, bytes]:
     """Of the policy and a shield."""
-    path = tmp_path_factory.mktemp("c")
-    write_files(path, export(agent, "c", ShieldConfig()))
-    return path
-
-
-@pytest.fixture(scope="module")
-def library(folder) -> CLibrary:
-    return CLibrary(folder)
+    return export(agent, "c", ShieldConfig())
 
 
 def run(*command: object, **environment: str) -> subprocess.CompletedProcess[str]:

@@ -4,7 +4,6 @@ import dataclasses
 import re
 import shutil
 import subprocess
-from pathlib import Path
 
 import jax.export
 import numpy as np
@@ -47,15 +46,8 @@ def vectors(agent) -> Golden:
 
 
 @pytest.fixture(scope="module")
-def c_folder(agent, tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("c")
-    write_files(folder, export(agent, "c"))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def library(c_folder) -> CLibrary:
-    return CLibrary(c_folder)
+def exported(agent) -> dict[str, bytes]:
+    return export(agent, "c")
 
 
 @pytest.fixture(scope="module")
@@ -116,9 +108,9 @@ def test_c_of_the_agent_that_minds_the_zone(tmp_path):
 
 
 @needs_compiler
-def test_c_is_strict_and_needs_nothing_but_libm(c_folder, tmp_path):
+def test_c_is_strict_and_needs_nothing_but_libm(folder, tmp_path):
     extra = ["-Wconversion", "-Wdouble-promotion", "-Wshadow"]
-    build = ["cc", *STRICT, *extra, "-c", c_folder / "koz_policy.c", "-o", tmp_path / "koz_policy.o"]
+    build = ["cc", *STRICT, *extra, "-c", folder / "koz_policy.c", "-o", tmp_path / "koz_policy.o"]
     subprocess.run(build, check=True)
     symbols = subprocess.run(["nm", "-u", tmp_path / "koz_policy.o"], capture_output=True, text=True, check=True)
     assert set(re.findall(r"U (\w+)", symbols.stdout)) <= {
@@ -131,8 +123,8 @@ def test_c_is_strict_and_needs_nothing_but_libm(c_folder, tmp_path):
 
 
 @needs_compiler
-def test_the_self_test_passes_and_notices_a_changed_weight(c_folder, tmp_path):
-    folder = shutil.copytree(c_folder, tmp_path / "c")
+def test_the_self_test_passes_and_notices_a_changed_weight(folder, tmp_path):
+    folder = shutil.copytree(folder, tmp_path / "c")
     done = tiny.make_test(folder)
     assert done.returncode == 0 and "golden vectors: 100" in done.stdout and "passed" in done.stdout
     assert "warning" not in done.stdout + done.stderr
@@ -254,10 +246,10 @@ def test_stablehlo_reloads_and_decides_alike(agent, vectors):
     assert "tensor<16xf32>" in text and "stablehlo.dot_general" in text
 
 
-def test_every_export_carries_its_metadata(agent, session, c_folder):
+def test_every_export_carries_its_metadata(agent, session, folder):
     metadata = describe(agent.to_numpy())
     files = export(agent, "stablehlo")
-    texts = [files["koz_policy.mlir"].decode(), *((c_folder / f"koz_policy.{kind}").read_text() for kind in "ch")]
+    texts = [files["koz_policy.mlir"].decode(), *((folder / f"koz_policy.{kind}").read_text() for kind in "ch")]
     for text in texts:
         flat = " ".join(re.sub(r"\n *(\*|//)? *", " ", text[:4000]).split())
         for name in layout():

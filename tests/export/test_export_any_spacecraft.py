@@ -54,10 +54,8 @@ def task(request) -> TaskConfig:
 
 
 @pytest.fixture(scope="module")
-def folder(task, tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("c")
-    write_files(path, export(AGENT, "c", task=task))
-    return path
+def exported(task) -> dict[str, bytes]:
+    return export(AGENT, "c", task=task)
 
 
 @pytest.fixture(scope="module")

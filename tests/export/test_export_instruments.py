@@ -3,7 +3,6 @@
 import functools
 import re
 import shutil
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -46,18 +45,6 @@ COUNT = 500
 @pytest.fixture(scope="module")
 def exported() -> dict[str, bytes]:
     return export(AGENT, "c", SHIELD, TASK, FURTHER)
-
-
-@pytest.fixture(scope="module")
-def folder(exported, tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("c")
-    write_files(path, exported)
-    return path
-
-
-@pytest.fixture(scope="module")
-def library(folder) -> CLibrary:
-    return CLibrary(folder)
 
 
 @pytest.fixture(scope="module")

@@ -55,13 +55,6 @@ def exported(agent) -> dict[str, bytes]:
 
 
 @pytest.fixture(scope="module")
-def library(exported, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("shield")
-    write_files(folder, exported)
-    return CLibrary(folder)
-
-
-@pytest.fixture(scope="module")
 def vectors(agent) -> np.ndarray:
     return rows(shield_situations(agent, CONFIG, COUNT, seed=4)[0])
 

@@ -4,7 +4,6 @@ import dataclasses
 import re
 import shutil
 import subprocess
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -81,18 +80,6 @@ def exported(task) -> dict[str, bytes]:
         # Of the same shape as what is drawn below, and compiled once.
         patch.setattr(files, "GOLDEN_VECTORS", COUNT)
         return export(AGENT, "c", task=task)
-
-
-@pytest.fixture(scope="module")
-def folder(exported, tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("c")
-    write_files(path, exported)
-    return path
-
-
-@pytest.fixture(scope="module")
-def library(folder) -> CLibrary:
-    return CLibrary(folder)
 
 
 @pytest.fixture(scope="module")
