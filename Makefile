@@ -4,6 +4,9 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt
 
+# What is imported is compiled once and kept; to compile all of jax takes seconds, at every start.
+unexport PYTHONDONTWRITEBYTECODE
+
 # One worker for each core; in the order that tests/conftest.py gives the files.
 WORKERS := -n auto --dist loadfile --no-loadscope-reorder
 
