@@ -18,6 +18,7 @@ from koz_jax.config.maneuvers.maneuver_file import load_spacecraft
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.spread import Urgency
 from koz_jax.config.uncertainty import CERTAIN, UncertaintyConfig
+from koz_jax.errors import SettingsError
 
 
 class _FormatFlags(Settings):
@@ -31,7 +32,7 @@ class _FormatFlags(Settings):
     spacecraft: Path | None = None
     """Of an agent for any spacecraft, the one that it is exported for, and the shield with it: a TOML file with a table
     [spacecraft] and step_seconds, such as a maneuver file; by default that of the agent's task.  C knows all of its
-    [[instruments]], the other formats the first."""
+    [[instruments]]; the other formats take a file with one."""
     urgency: Urgency | None = Field(default=None, description=URGENCY)
     shield: bool = False
     """Also write the shield, which keeps the boresight out of every zone; for --to c."""
@@ -92,8 +93,13 @@ def _export(asked: ExportFlags) -> int:
     if asked.spacecraft is not None:
         described = load_spacecraft(asked.spacecraft)
         task = described.task
-        if asked.to == "c" and agent.controller.network.scaled:
+        if agent.controller.network.scaled:
             further = tuple(instrument.boresight for instrument in described.instruments[1:])
+        if further and asked.to != "c":
+            raise SettingsError(
+                f"spacecraft: {asked.spacecraft} has {1 + len(further)} instruments, of which only --to c knows all;"
+                f" leave one in the file, got --to {asked.to}"
+            )
     if asked.urgency is not None:
         agent = agent.with_urgency(asked.urgency)
     make_folder("out", asked.out)

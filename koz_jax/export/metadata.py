@@ -201,8 +201,7 @@ def as_text(metadata: Metadata) -> str:
         *_instruments_text(metadata.further_instruments),
         f"Limits: torque {_torque(metadata.torque_limit)}; time step {metadata.step_seconds:g} s;"
         f" boresight {list(metadata.boresight_B)} in body axes; inertia {[list(r) for r in task.spacecraft.inertia]}"
-        f" kg m^2; trained for {_count(task.scenario)} of {task.scenario.min_half_angle_deg:g} to"
-        f" {task.scenario.max_half_angle_deg:g} deg half angle and maneuvers that start {_start(task.scenario)}.",
+        f" kg m^2; {_training(metadata.network, task.scenario)}.",
         "",
         f"Trained by: {origin.command or 'unknown'} (commit {origin.commit or 'unknown'}, seed {origin.seed}).",
         f"Hash of the training run's config.json: {origin.config_sha256 or 'unknown'}",
@@ -248,6 +247,17 @@ def _matrix(rows: Iterable[Vector]) -> str:
 
 def _seen(scaling: Scaling) -> str:
     return "; ".join(f"{name} {_row(values)}" for name, values in scaling.seen.items())
+
+
+def _training(network: NetworkConfig, scenario: ScenarioConfig) -> str:
+    if network.scaled:
+        # The scenario is that of its evaluation: which zones its training drew is not in the record.
+        nearest = "zone" if network.observed_zones == 1 else f"{network.observed_zones} zones"
+        return f"trained for any spacecraft, sees the nearest {nearest}"
+    return (
+        f"trained for {_count(scenario)} of {scenario.min_half_angle_deg:g} to {scenario.max_half_angle_deg:g} deg half"
+        f" angle and maneuvers that start {_start(scenario)}"
+    )
 
 
 def _count(scenario: ScenarioConfig) -> str:

@@ -232,6 +232,7 @@ def test_the_command_line(tmp_path, capsys):
     expected = export(load_agent(tmp_path / "agent"), "c", task=CUBESAT)
     assert {name: (tmp_path / "c" / name).read_bytes() for name in expected} == expected
     header = (tmp_path / "c" / "koz_policy.h").read_text()
+    assert "trained for any spacecraft, sees the nearest" in " ".join(header.replace("\n *", "").split())
     assert "#define KOZ_STEP_SECONDS 0.2f" in header and "#define KOZ_TORQUE_LIMIT 0.004f" in header
     assert tiny.status("export", tmp_path / "agent", *out, "--spacecraft", file, "--urgency", 0.25) == 0
     assert "#define KOZ_URGENCY 0.25f" in (tmp_path / "c" / "koz_policy.h").read_text()
@@ -246,6 +247,17 @@ def test_the_command_line(tmp_path, capsys):
     assert "error: spacecraft.gyros: are not exported yet" in capsys.readouterr().err
     assert tiny.status("export", tmp_path / "agent", *out, "--spacecraft", tmp_path / "none.toml") == 2
     assert "none.toml cannot be read" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("to", ["onnx", "stablehlo"])
+def test_formats_that_know_one_instrument_refuse_a_file_with_two(to, tmp_path, capsys):
+    file = tmp_path / "two.toml"
+    text = (tiny.ROOT / "examples" / "cubesat_6u.toml").read_text()
+    file.write_text(text + '\n[[instruments]]\nname = "second"\nboresight = [1, 0, 0]\n')
+    assert tiny.status("export", "universal", "--to", to, "--out", tmp_path / "out", "--spacecraft", file) == 2
+    err = capsys.readouterr().err
+    assert f"two.toml has 2 instruments, of which only --to c knows all; leave one in the file, got --to {to}" in err
+    assert not (tmp_path / "out").exists()
 
 
 @needs_compiler
