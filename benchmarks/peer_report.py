@@ -13,7 +13,8 @@ keeps its result of before. Numbers behind it: [`peers.json`](peers.json).
 
 Every peer trains on deviations of 80 to 180 deg with the paper's reward and observation, with networks of 256-256 and
 batches of 256, through its best wrapper of the environment. Beyond that it has the settings of the table, mostly its
-own defaults; nobody tuned them for this task, as ours were. Ours is `koz train --preset fast` as it stands.
+own defaults; nobody tuned them for this task, as ours were. Ours is `koz train --preset fast` of the commit in
+the table of settings.
 
 The clock of a peer begins before the first step and stands still while it is evaluated. Ours begins with the process
 and counts imports, compilation and its own evaluations. Success is settled and no zone entered, in 1,000 cases that no
@@ -116,7 +117,7 @@ def markdown(report: Report) -> str:
         _INTRO.rstrip(),
         "## Learning\n\n" + _learning(report),
         "Updates/s are with networks of 256-256 and batches of 256, environment steps included, in the best stretch"
-        " between two evaluations; for koz_jax measured apart, because its preset has networks of 128-128."
+        " between two evaluations; for koz_jax measured apart, because its preset has smaller networks."
         " PPO's updates are of 512 unrolls of 20 steps, not of 256 transitions.",
         _bound(report),
         "## Monte Carlo after the training\n\n" + _monte_carlo(report),

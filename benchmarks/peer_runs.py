@@ -31,6 +31,7 @@ from koz_jax.control.base import Controller
 from koz_jax.evaluation.cases import fly_cases
 from koz_jax.evaluation.summary import Summary, summarise
 from koz_jax.learning import train_step
+from koz_jax.runs import provenance
 from koz_jax.task import observation_layout
 
 ENVS, UPDATES = 64, 8  # environments, and updates per step of all of them, for the off-policy peers
@@ -151,7 +152,13 @@ def _ours(minutes: float) -> Run:
         for point in points:
             print(f"  {point.seconds:5.0f} s, {point.updates} updates: {point.success_rate:.1%}", flush=True)
         controller = load_agent(run).controller
-    recipe = "--preset fast: curriculum, 3-step returns, encoding, 128-128 networks, 512 environments, refinement"
+    fast = preset("fast")
+    updates = fast.curriculum.phase1.updates + fast.curriculum.phase2.updates
+    recipe = (
+        f"--preset fast at commit {provenance.commit()[:7] or 'unknown'}: {updates:,} updates of {fast.sac.batch_size},"
+        f" {fast.refine.iterations} iterations of refinement, curriculum, {fast.sac.n_step}-step returns, encoding,"
+        f" {'-'.join(map(str, fast.network.hidden_sizes))} networks, {fast.num_envs} environments"
+    )
     version = f"koz_jax {metadata.version('koz_jax')}"
     return Run(points, _our_update_rate(), controller, recipe, version)
 
@@ -177,7 +184,11 @@ def _evaluations(log: Path, seconds: float) -> list[Point]:
 def _our_update_rate(steps: int = 100, stretches: int = 10) -> float:
     """Updates per second of our training loop with the paper's networks and batch, in the best stretch."""
     fast = preset("fast")
-    config = fast.model_copy(update={"network": NetworkConfig(hidden_sizes=(256, 256))})
+    sizes = {
+        "network": NetworkConfig(hidden_sizes=(256, 256)),
+        "sac": fast.sac.model_copy(update={"batch_size": 256}),
+    }
+    config = fast.model_copy(update=sizes)
     state = train_step.init(config, jax.random.key(0))
     rates = []
     for _ in range(stretches):
