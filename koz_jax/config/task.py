@@ -105,7 +105,7 @@ class SpacecraftConfig(SettingsOfAgents):
         return self
 
 
-class RewardConfig(Settings):
+class RewardConfig(SettingsOfAgents):
     """Constants of the reward (Eq. 7 to 9 of the paper)."""
 
     attitude_scale: PositiveFloat = 0.14 * 2 * np.pi

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 from pydantic import ValidationError
@@ -11,7 +11,7 @@ from koz_jax.config.base import Settings, checked, constant, ramp_value
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.presets import named as presets
 from koz_jax.config.shield import ShieldConfig
-from koz_jax.config.task import SpacecraftConfig, TaskConfig, check_deviations, is_paper_task
+from koz_jax.config.task import RewardConfig, SpacecraftConfig, TaskConfig, check_deviations, is_paper_task
 from koz_jax.config.training import TrainConfig
 from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.errors import KozError, SettingsError, explain
@@ -264,3 +264,14 @@ def test_settings_of_a_caller_are_refused_with_an_error_of_ours():
 )
 def test_the_papers_numbers_are_of_its_task_only(changes, papers):
     assert is_paper_task(TaskConfig.model_validate(changes)) == papers
+
+
+def test_a_constant_of_the_reward_that_came_later_is_written_only_where_it_is_set():
+    class Extended(RewardConfig):
+        later: ClassVar = ("nearness_cost",)
+
+        nearness_cost: float = 0.0
+
+    assert Extended().model_dump() == RewardConfig().model_dump()
+    assert Extended(nearness_cost=0.5).model_dump() == RewardConfig().model_dump() | {"nearness_cost": 0.5}
+    assert Extended.model_validate(RewardConfig().model_dump()) == Extended()

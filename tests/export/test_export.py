@@ -11,6 +11,7 @@ import pytest
 from support import oracle, tiny
 
 from koz_jax.agents.agent import Agent, load_agent
+from koz_jax.agents.numpy_policy import load_policy
 from koz_jax.agents.record import Provenance
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.training import NO_ENCODING
@@ -268,6 +269,21 @@ def test_the_hash_is_of_the_training_and_not_of_its_verdict(agent):
     judged = record.model_copy(update={"provenance": record.provenance.model_copy(update={"table": {"cases": 1}})})
     reseeded = record.model_copy(update={"provenance": record.provenance.model_copy(update={"seed": 9})})
     assert training_sha256(judged) == training_sha256(record) != training_sha256(reseeded)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("phase1", "85e260137ae333a7e467fe84ff5a2c769a5e7db3c5c1af6099538bc4c2ec2dd7"),
+        ("phase2", "a3928d29a134624bcdafe2139a6e824c8726c0f5ce101473c0c52bc9f794d60e"),
+        ("phase2-sac", "69e126d206a045ab577fa8c3e50bf5e27f4e0ddfe558e13e27a57b864f1a4547"),
+        ("universal", "021b764a77868ff9ae832ffaef364bbf495ed4977caad0307879ec217bc53e48"),
+        ("zones3", "9a9011652d6f56fcbb1d870f5782a5d22bda37bd9303524acceaa4d99e2ec41d"),
+    ],
+)
+def test_hashes_of_shipped_agents_stay_where_settings_get_new_fields(name, expected):
+    """New ones belong into ``later``; another agent under the name has another hash."""
+    assert training_sha256(load_policy(name).record) == expected
 
 
 def test_a_provenance_cannot_leave_its_comment(agent):
