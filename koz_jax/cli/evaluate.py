@@ -5,9 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-from pydantic import model_validator
+from typing import TYPE_CHECKING
 
 from koz_jax.agents.record import DEFAULT_FOR_OTHERS
 from koz_jax.cli import invocation
@@ -54,13 +52,10 @@ class EvaluateFlags(ProcessFlags, FlightFlags, AgentFlags):
     history: Path | None = None
     """File for --replay-case; by default case-I.csv."""
 
-    @model_validator(mode="before")
-    @classmethod
-    def _for_any_spacecraft(cls, given: dict[str, Any]) -> dict[str, Any]:
-        """For another spacecraft or an urgency, the default is the agent that is for any."""
-        default = cls.model_fields["agent"].default
-        asks = given.get("spacecraft") is not None or given.get("urgency") is not None
-        return given | {"agent": DEFAULT_FOR_OTHERS} if asks and given.get("agent", default) == default else given
+    @property
+    def name(self) -> str:
+        """Name of the agent; for another spacecraft, the default is the one that is for any."""
+        return DEFAULT_FOR_OTHERS if self.agent is None and self.spacecraft is not None else super().name
 
     def task(self, agent: TaskController) -> TaskConfig:
         """What is flown: the agent's task, or the paper's draw for another spacecraft, with the changes of the flags.

@@ -287,11 +287,29 @@ def test_another_spacecraft_is_flown_in_its_own_units(tmp_path):
     assert task.effort_to_paper == pytest.approx(100.0**2 * 10**0.5)
 
 
-def test_flags_of_the_agent_for_any_spacecraft():
-    flags = parsing.parse(EvaluateFlags, ["--spacecraft", "random"], "koz evaluate")
-    assert flags.agent == "universal"
-    assert parsing.parse(EvaluateFlags, ["--urgency", "0.2"], "koz evaluate").agent == "universal"
-    assert parsing.parse(EvaluateFlags, [], "koz evaluate").agent == "phase2"
+@pytest.mark.parametrize(
+    ("argv", "name"),
+    [
+        ("", "phase2"),
+        ("--spacecraft random", "universal"),
+        ("--urgency 0.2", "universal"),
+        ("--agent phase2 --spacecraft random", "phase2"),
+        ("--agent phase2 --urgency 0.2", "phase2"),
+        ("--agent zones3 --spacecraft random", "zones3"),
+    ],
+)
+def test_an_agent_that_is_named_is_flown_and_where_none_is_the_one_that_is_for_it(argv, name):
+    assert parsing.parse(EvaluateFlags, argv.split(), "koz evaluate").name == name
+
+
+def test_a_named_agent_of_one_spacecraft_is_flown_on_another_and_does_not_hurry(capsys):
+    """In place of another agent that can."""
+    cubesat = tiny.MANEUVER_FILES["cubesat_6u"]
+    assert tiny.status("evaluate", "--agent", "phase2", "--spacecraft", cubesat, "--cases", tiny.CASES) == 0
+    told = capsys.readouterr()
+    assert "phase2" in told.out and "universal" not in told.out
+    assert "phase2 was not made for this: " in told.err
+    assert "urgency: phase2 was trained for one trade" in refused(capsys, "--agent", "phase2", "--urgency", 0.8)
 
 
 def test_a_spacecraft_that_cannot_be_read_is_refused(capsys, no_flight):

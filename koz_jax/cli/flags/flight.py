@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from koz_jax.agents.record import DEFAULT_AGENT, shipped_agents
+from koz_jax.agents.record import DEFAULT_AGENT, DEFAULT_FOR_OTHERS, shipped_agents
 from koz_jax.cli.flags import parsing
 from koz_jax.cli.flags.parsing import ChangesOf, agents_own, same_as
 from koz_jax.config.base import MarginDeg, NonNegativeFloat, Settings, ZoneCount
@@ -42,11 +42,22 @@ CONTROLLERS = (
 class AgentFlags(Settings):
     """Who flies."""
 
-    agent: str = Field(default=DEFAULT_AGENT, description=f"Who flies: {AGENT}.")
+    agent: str | None = Field(
+        default=None,
+        description=f"Who flies: {AGENT}. By default {DEFAULT_AGENT}; for another spacecraft or an urgency,"
+        f" {DEFAULT_FOR_OTHERS}.",
+    )
     controller: str | None = Field(
         default=None, description=f"Fly this on the agent's task in place of the agent: {CONTROLLERS}."
     )
     urgency: Urgency | None = Field(default=None, description=URGENCY)
+
+    @property
+    def name(self) -> str:
+        """Name of the agent: the one that is asked for, whatever it is to fly; else the default."""
+        if self.agent is not None:
+            return self.agent
+        return DEFAULT_AGENT if self.urgency is None else DEFAULT_FOR_OTHERS
 
     def load(self) -> TaskController:
         """Load who flies.
@@ -59,7 +70,7 @@ class AgentFlags(Settings):
         from koz_jax.agents.flight import in_a_hurry
         from koz_jax.control.registry import load_controller
 
-        flying = load_agent(self.agent)
+        flying = load_agent(self.name)
         if self.controller is not None:
             flying = load_controller(self.controller, flying.task)
         return flying if self.urgency is None else in_a_hurry(flying, self.urgency)
