@@ -1,6 +1,7 @@
 """``koz fly``, and the figures of ``koz evaluate``: what they write, and what they refuse."""
 
 import csv
+import dataclasses
 import io
 import json
 import re
@@ -15,8 +16,9 @@ from koz_jax.cli.flags import parsing
 from koz_jax.cli.fly import FlyFlags
 from koz_jax.config.maneuvers.maneuver_file import load_maneuver
 from koz_jax.config.shield import ShieldConfig
-from koz_jax.config.task import TaskConfig
+from koz_jax.config.task import SpacecraftConfig, TaskConfig
 from koz_jax.config.uncertainty import UncertaintyConfig
+from koz_jax.errors import SettingsError
 from koz_jax.evaluation import cases
 
 
@@ -124,6 +126,28 @@ def test_flags_make_a_maneuver_of_the_agents_spacecraft():
     assert found.start.attitude == pytest.approx(HALF, abs=1e-5) and found.target.attitude == (1, 0, 0, 0)
     (cone,) = found.constraints
     assert (cone.direction, cone.half_angle_deg) == ((0.0, 1.0, 0.0), 12.0)
+
+
+def _turn_of(spacecraft: SpacecraftConfig, tmp_path: Path) -> FlyFlags:
+    """A turn with an agent that was made for a spacecraft."""
+    untrained = tiny.untrained_agent()
+    task = untrained.task.model_copy(update={"spacecraft": spacecraft})
+    dataclasses.replace(untrained, task=task).save(tmp_path / "own")
+    return parsed("--agent", tmp_path / "own", "--from", *HALF, "--to", 1, 0, 0, 0, "--keep-out", 0, 1, 0, 12)
+
+
+def test_flags_take_the_agents_whole_spacecraft(tmp_path):
+    """With its wheels and its rate limit."""
+    leo = load_maneuver(tiny.MANEUVER_FILES["leo_6u"]).task.spacecraft
+    for own in (leo, SpacecraftConfig(torque_limit=(1.0, 2.0, 3.0), max_rate_deg=5.0)):
+        found = _turn_of(own, tmp_path).own_maneuver
+        assert found is not None and found.task.spacecraft == own
+
+
+def test_flags_refuse_an_agents_gyros_of_which_a_file_is_needed(tmp_path):
+    own = load_maneuver(tiny.MANEUVER_FILES["cmg_smallsat"]).task.spacecraft
+    with pytest.raises(SettingsError, match=r"spacecraft\.gyros: must be none, got 4; a file"):
+        _turn_of(own, tmp_path)
 
 
 def test_flags_take_the_spacecraft_of_a_file(tmp_path):

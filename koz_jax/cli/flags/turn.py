@@ -11,6 +11,7 @@ from pydantic import ValidationError, model_validator
 from koz_jax.config.base import Settings
 from koz_jax.config.maneuvers.maneuver import ManeuverConfig
 from koz_jax.config.maneuvers.maneuver_file import load_spacecraft
+from koz_jax.config.maneuvers.maneuver_tables import BodyConfig
 from koz_jax.config.task import TaskConfig
 from koz_jax.errors import explain
 
@@ -36,7 +37,7 @@ class TurnFlags(Settings):
     """With --from and --to: a cone to stay out of, its axis in inertial axes and its half angle [deg]."""
     spacecraft: Path | None = None
     """With --from and --to: a TOML file with a table [spacecraft] and step_seconds, such as a maneuver file, whose
-    first instrument is taken; by default the agent's spacecraft."""
+    first instrument is taken; by default the agent's spacecraft, with its actuators and rate limit."""
 
     @model_validator(mode="after")
     def _from_and_to(self) -> Self:
@@ -54,7 +55,7 @@ class TurnFlags(Settings):
 
         Raises:
             SettingsError: the file cannot be read.
-            ValueError: the flags make no maneuver; a line for each that is wrong.
+            ValueError: the flags make no maneuver, a line for each that is wrong; or the agent's spacecraft has gyros.
 
         """
         if self.spacecraft is None:
@@ -62,7 +63,7 @@ class TurnFlags(Settings):
                 "step_seconds": own.step_seconds,
                 "duration_seconds": own.episode_seconds,
                 "settled_angle_deg": own.reward.settled_angle_deg,
-                "spacecraft": {"inertia": own.spacecraft.inertia, "torque_limit": own.spacecraft.torque_limit},
+                "spacecraft": BodyConfig.of(own.spacecraft),
                 "instruments": [{"name": _INSTRUMENT, "boresight": own.spacecraft.boresight}],
             }
         else:

@@ -97,6 +97,27 @@ class BodyConfig(Table):
             )
         return self
 
+    @classmethod
+    def of(cls, spacecraft: SpacecraftConfig) -> BodyConfig:
+        """The same of a spacecraft, whose instrument is left out.
+
+        Raises:
+            ValueError: it has gyros, of which a file knows a pyramid only.
+
+        """
+        if spacecraft.gyros:
+            raise ValueError(
+                f"spacecraft.gyros: must be none, got {len(spacecraft.gyros)}; a file with a table [spacecraft.gyros] can"
+                " describe a pyramid of them"
+            )
+        wheels = tuple(WheelTable(**wheel.model_dump()) for wheel in spacecraft.wheels)
+        return cls(
+            inertia=spacecraft.inertia,
+            torque_limit=None if wheels else spacecraft.torque_limit,
+            wheels=wheels,
+            max_rate_deg=spacecraft.max_rate_deg,
+        )
+
     def spacecraft(self, boresight: Vector) -> SpacecraftConfig:
         """The same with an instrument.  boresight: unit vector in body axes."""
         limit = {} if self.torque_limit is None else {"torque_limit": self.torque_limit}
