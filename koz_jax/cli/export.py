@@ -15,6 +15,7 @@ from koz_jax.cli.flags import parsing
 from koz_jax.cli.flags.flight import AGENT, URGENCY
 from koz_jax.config.base import MarginDeg, NonNegativeFloat, Settings
 from koz_jax.config.maneuvers.maneuver_file import load_spacecraft
+from koz_jax.config.maneuvers.maneuver_tables import ConstraintConfig, fastest_cone_deg
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.spread import Urgency
 from koz_jax.config.uncertainty import CERTAIN, UncertaintyConfig
@@ -32,12 +33,15 @@ class _FormatFlags(Settings):
     spacecraft: Path | None = None
     """Of an agent for any spacecraft, the one that it is exported for, and the shield with it: a TOML file with a table
     [spacecraft] and step_seconds, such as a maneuver file; by default that of the agent's task.  C knows all of its
-    [[instruments]]; the other formats take a file with one."""
+    [[instruments]]; the other formats take a file with one.  The shield is for cones as fast as the fastest of its
+    [[constraints]]."""
     urgency: Urgency | None = Field(default=None, description=URGENCY)
     shield: bool = False
     """Also write the shield, which keeps the boresight out of every zone; for --to c."""
     shield_margin_deg: MarginDeg = parsing.same_as(ShieldConfig, "margin_deg")
-    cone_rate_deg: NonNegativeFloat = parsing.same_as(ShieldConfig, "cone_rate_deg")
+    cone_rate_deg: NonNegativeFloat | None = None
+    """Largest rate of a cone's axis that the shield is kept against [deg/s]; by default the largest rotation_deg of the
+    constraints in the file of --spacecraft, without one 0."""
     robust: bool = False
     """Make the shield withstand errors, which the flags of errors set."""
 
@@ -67,14 +71,25 @@ class ExportFlags(UncertaintyConfig, _FormatFlags):
     def _errors(self) -> UncertaintyConfig:
         return UncertaintyConfig(**self.model_dump(include={*UncertaintyConfig.model_fields}))
 
-    @property
-    def shield_config(self) -> ShieldConfig | None:
-        """The shield to export, if one is asked for."""
+    def shield_config(self, constraints: Sequence[ConstraintConfig]) -> ShieldConfig | None:
+        """The shield to export, if one is asked for.
+
+        constraints: of the file of ``spacecraft``, which it must withstand.
+
+        Raises:
+            SettingsError: they turn faster than the cones that are told of.
+
+        """
         if not self.shield:
             return None
-        return ShieldConfig(
-            margin_deg=self.shield_margin_deg, cone_rate_deg=self.cone_rate_deg, error_bounds=self._errors
-        )
+        fastest = fastest_cone_deg(constraints)
+        rate = fastest if self.cone_rate_deg is None else self.cone_rate_deg
+        if rate < fastest * (1.0 - 1e-5):  # as it is printed, it will do
+            raise SettingsError(
+                f"cone_rate_deg: must be at least {fastest:.6g}, the rate of the fastest of the constraints in"
+                f" {self.spacecraft}, got {rate:g}; by default it is that"
+            )
+        return ShieldConfig(margin_deg=self.shield_margin_deg, cone_rate_deg=rate, error_bounds=self._errors)
 
 
 def main(argv: Sequence[str]) -> int:
@@ -89,10 +104,10 @@ def _export(asked: ExportFlags) -> int:
     from koz_jax.storage.files import make_folder
 
     agent = load_agent(asked.agent)
-    task, further = None, ()
+    task, further, constraints = None, (), ()
     if asked.spacecraft is not None:
         described = load_spacecraft(asked.spacecraft)
-        task = described.task
+        task, constraints = described.task, described.constraints
         if agent.controller.network.scaled:
             further = tuple(instrument.boresight for instrument in described.instruments[1:])
         if further and asked.to != "c":
@@ -102,7 +117,8 @@ def _export(asked: ExportFlags) -> int:
             )
     if asked.urgency is not None:
         agent = agent.with_urgency(asked.urgency)
+    shield = asked.shield_config(constraints)
     make_folder("out", asked.out)
-    for path in write_files(asked.out, export(agent, asked.to, asked.shield_config, task, further)):
+    for path in write_files(asked.out, export(agent, asked.to, shield, task, further)):
         print(path)
     return 0

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from koz_jax.config.maneuvers.maneuver import ManeuverConfig
-from koz_jax.config.maneuvers.maneuver_tables import ConstraintConfig
+from koz_jax.config.maneuvers.maneuver_tables import ConstraintConfig, fastest_cone_deg
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.task import TaskConfig
 from koz_jax.control.base import TaskController
@@ -82,8 +82,7 @@ def config_of(maneuver: ManeuverConfig, config: MonteCarloConfig) -> MonteCarloC
     if maneuver.has_errors:
         changes["uncertainty"] = maneuver.errors.uncertainty
     if config.shield is not None:
-        fastest = max((float(np.linalg.norm(one.rotation_deg)) for one in maneuver.constraints), default=0.0)
-        cone_rate = max(fastest, config.shield.cone_rate_deg)
+        cone_rate = max(fastest_cone_deg(maneuver.constraints), config.shield.cone_rate_deg)
         changes["shield"] = config.shield.model_copy(update={"cone_rate_deg": cone_rate})
     return config.model_copy(update=changes)
 

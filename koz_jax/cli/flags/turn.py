@@ -68,7 +68,7 @@ class TurnFlags(Settings):
             }
         else:
             found = load_spacecraft(self.spacecraft)
-            given = found.model_dump(exclude={"name"})
+            given = found.model_dump(exclude={"name", "constraints"})
             if not found.instruments:
                 given["instruments"] = [{"name": _INSTRUMENT, "boresight": own.spacecraft.boresight}]
         instrument = given["instruments"][0]["name"]

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from koz_jax.config.base import PositiveFloat
 from koz_jax.config.maneuvers.maneuver import ManeuverConfig
-from koz_jax.config.maneuvers.maneuver_tables import BodyConfig, InstrumentConfig, Table
+from koz_jax.config.maneuvers.maneuver_tables import BodyConfig, ConstraintConfig, InstrumentConfig, Table
 from koz_jax.config.task import TaskConfig
 from koz_jax.errors import SettingsError, explain
 
@@ -21,7 +21,7 @@ TableType = TypeVar("TableType", bound=Table)
 
 
 class SpacecraftFile(Table):
-    """A spacecraft with its instruments, without a maneuver."""
+    """A spacecraft with its instruments and their constraints, without a maneuver."""
 
     name: str = ""
     """What to call it."""
@@ -34,7 +34,9 @@ class SpacecraftFile(Table):
     spacecraft: BodyConfig
     """What turns."""
     instruments: tuple[InstrumentConfig, ...] = ()
-    """What looks; constraints that name none are for the first."""
+    """What looks."""
+    constraints: tuple[ConstraintConfig, ...] = ()
+    """What must not be looked at.  Draws have zones of their own; an exported shield is made for these."""
 
     @property
     def task(self) -> TaskConfig:
@@ -68,7 +70,8 @@ def load_maneuver(path: Path | str) -> ManeuverConfig:
 
 
 def load_spacecraft(path: Path | str) -> SpacecraftFile:
-    """Read a file with a table [spacecraft]; of a maneuver file only the spacecraft, its instruments and its step.
+    """Read a file with a table [spacecraft]; of a maneuver file only the spacecraft with its step, its instruments and
+    their constraints.
 
     Raises:
         SettingsError: see ``load_maneuver``.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
@@ -194,6 +195,11 @@ class ConstraintConfig(Table):
     def forbidden_side(self) -> str:
         """Where it may not look."""
         return "inside" if self.kind == "keep_out" else "outside"
+
+
+def fastest_cone_deg(constraints: Iterable[ConstraintConfig]) -> float:
+    """Rate of the axis that turns fastest [deg/s]; 0 where none turns."""
+    return max((float(np.linalg.norm(one.rotation_deg)) for one in constraints), default=0.0)
 
 
 class StartConfig(Table):
