@@ -107,9 +107,12 @@ def from_arrays(arrays: Mapping[str, np.ndarray], record: Record, name: str) -> 
     return NumpyPolicy(views(network), tuple(layers), record, name, dials(network))
 
 
-def exported_zone_count(network: NetworkConfig, scenario: ScenarioConfig) -> int:
-    """Zones that an exported controller is told of: all there may be, of which the policy sees the nearest."""
-    return max(network.observed_zones, scenario.max_zones)
+def exported_zone_count(network: NetworkConfig, scenario: ScenarioConfig, least: int = 0) -> int:
+    """Zones that an exported controller is told of: all there may be, of which the policy sees the nearest.
+
+    least: so many at least, such as a maneuver file has constraints.
+    """
+    return max(network.observed_zones, scenario.max_zones, least)
 
 
 def layer_names(number: int) -> tuple[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, Self
@@ -21,6 +22,8 @@ from koz_jax.config.spread import Urgency
 from koz_jax.config.uncertainty import CERTAIN, UncertaintyConfig
 from koz_jax.errors import SettingsError
 
+_log = logging.getLogger(__name__)
+
 
 class _FormatFlags(Settings):
     """Who is exported to what."""
@@ -33,8 +36,8 @@ class _FormatFlags(Settings):
     spacecraft: Path | None = None
     """Of an agent for any spacecraft, the one that it is exported for, and the shield with it: a TOML file with a table
     [spacecraft] and step_seconds, such as a maneuver file; by default that of the agent's task.  C knows all of its
-    [[instruments]]; the other formats take a file with one.  The shield is for cones as fast as the fastest of its
-    [[constraints]]."""
+    [[instruments]], and is told of as many zones as it has [[constraints]]; the other formats take a file with one
+    instrument.  The shield is for cones as fast as the fastest of the constraints."""
     urgency: Urgency | None = Field(default=None, description=URGENCY)
     shield: bool = False
     """Also write the shield, which keeps the boresight out of every zone; for --to c."""
@@ -118,7 +121,18 @@ def _export(asked: ExportFlags) -> int:
     if asked.urgency is not None:
         agent = agent.with_urgency(asked.urgency)
     shield = asked.shield_config(constraints)
+    _tell_of_unseen(agent.controller.network.observed_zones, asked, len(constraints))
     make_folder("out", asked.out)
-    for path in write_files(asked.out, export(agent, asked.to, shield, task, further)):
+    for path in write_files(asked.out, export(agent, asked.to, shield, task, further, len(constraints))):
         print(path)
     return 0
+
+
+def _tell_of_unseen(seen: int, asked: ExportFlags, constraints: int) -> None:
+    """Log a warning where the file has more constraints than a policy sees."""
+    if seen < constraints:
+        shielded = "; the shield keeps all" if asked.shield else ""
+        _log.warning(
+            "spacecraft: %s has %d constraints, of which %s sees the nearest %d in every step%s",
+            *(asked.spacecraft, constraints, asked.agent, seen, shielded),
+        )

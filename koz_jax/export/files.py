@@ -29,6 +29,7 @@ def export(
     shield: ShieldConfig | None = None,
     task: TaskConfig | None = None,
     further_boresights: Sequence[Vector] = (),
+    least_zones: int = 0,
 ) -> dict[str, bytes]:
     """Contents of the exported files by their names.
 
@@ -39,6 +40,8 @@ def export(
         task: of an agent for any spacecraft, with the one that it is exported for; see ``made_for``.
         further_boresights: of an agent for any spacecraft, unit vectors (3,) in body axes of the instruments 1, 2, ...,
             such as of ``load_spacecraft(path).instruments[1:]``; of C only.  Number 0 is the task's own.
+        least_zones: C is told of so many zones at least, such as ``len(load_spacecraft(path).constraints)``, also where
+            the policy sees fewer.
 
     Raises:
         MissingExtraError: a package that the format needs is not installed.
@@ -50,7 +53,7 @@ def export(
     made = made_for(agent, task)
     policy = agent.to_numpy()
     further = _checked(further_boresights, to)
-    metadata = describe(policy, made.task, float(agent.controller.urgency), further)
+    metadata = describe(policy, made.task, float(agent.controller.urgency), further, least_zones if to == "c" else 0)
     # What only one format needs is imported for that format.
     if to == "onnx":
         from koz_jax.export.onnx import onnx_files
@@ -60,11 +63,11 @@ def export(
         from koz_jax.export.stablehlo import stablehlo_files
 
         return stablehlo_files(agent, metadata)
-    vectors = golden(made, GOLDEN_VECTORS, further_boresights=further)
-    contents = c_files(policy, metadata, vectors, example(made, bool(further)))
+    vectors = golden(made, GOLDEN_VECTORS, further_boresights=further, least_zones=least_zones)
+    contents = c_files(policy, metadata, vectors, example(made, bool(further), least_zones))
     if shield is None:
         return contents
-    answers = shield_golden(made, shield, GOLDEN_VECTORS, further_boresights=further)
+    answers = shield_golden(made, shield, GOLDEN_VECTORS, further_boresights=further, least_zones=least_zones)
     return contents | shield_files(metadata, shield, answers)
 
 

@@ -72,18 +72,21 @@ class Golden(NamedTuple):
     wheel_torque: np.ndarray  # (count, wheels) [N m] of each wheel for that torque
 
 
-def golden(agent: Agent, count: int, seed: int = 0, further_boresights: Sequence[Vector] = ()) -> Golden:
+def golden(
+    agent: Agent, count: int, seed: int = 0, further_boresights: Sequence[Vector] = (), least_zones: int = 0
+) -> Golden:
     """Draw situations, and urgencies where the policy sees one, and answer them.
 
-    further_boresights: unit vectors (3,) in body axes, of instruments beside the task's own.
+    further_boresights: unit vectors (3,) in body axes, of instruments beside the task's own; least_zones: so many are
+    told at least.
     """
     model, boresights_B = known(agent, further_boresights)
     network, wheels = agent.controller.network, agent.task.spacecraft.wheels
     instruments = 1 + len(further_boresights)
     if wheels:
-        drawn = _steady(situations(agent, _DRAWN_ON_WHEELS * count, seed, instruments), model, count)
+        drawn = _steady(situations(agent, _DRAWN_ON_WHEELS * count, seed, instruments, least_zones), model, count)
     else:
-        drawn = situations(agent, count, seed, instruments)
+        drawn = situations(agent, count, seed, instruments, least_zones)
     rng = np.random.default_rng(seed)
     # Sensors may hand over either sign, and what is observed stays the same.
     sign = rng.choice([-1.0, 1.0], (count, 1)).astype(np.float32)
@@ -96,14 +99,14 @@ def golden(agent: Agent, count: int, seed: int = 0, further_boresights: Sequence
     return Golden(rows(drawn.replace(q_BN=sign * drawn.q_BN)), memory, observed, action, torque, wheel_torque)
 
 
-def example(agent: Agent, several: bool = False) -> np.ndarray:
+def example(agent: Agent, several: bool = False, least_zones: int = 0) -> np.ndarray:
     """Where the maneuver of the exported example starts; its zones are for instrument 0, also of several.
 
-    Returns (entries,) float32, a row as in ``Golden``.
+    least_zones: so many are told at least.  Returns (entries,) float32, a row as in ``Golden``.
     """
     drawn = draw_case(agent.task, MonteCarloConfig(), EXAMPLE_CASE)
     zones = drawn.constraints
-    missing = exported_zone_count(agent.controller.network, agent.task.scenario) - zones.count
+    missing = exported_zone_count(agent.controller.network, agent.task.scenario, least_zones) - zones.count
     momenta = [wheel.momentum for wheel in agent.task.spacecraft.wheels]
     start = Situation(
         q_BN=drawn.initial.q_BN,
@@ -126,7 +129,7 @@ def rows(drawn: Situation) -> np.ndarray:
     return np.concatenate(columns, axis=1, dtype=np.float32)
 
 
-def situations(agent: Agent, count: int, seed: int = 0, instruments: int = 1) -> Situation:
+def situations(agent: Agent, count: int, seed: int = 0, instruments: int = 1, least_zones: int = 0) -> Situation:
     """Draw situations.  Returns leaves (count, ...).
 
     Angles to the target and rates are spread evenly over the orders of magnitude between resting on the target and
@@ -140,7 +143,7 @@ def situations(agent: Agent, count: int, seed: int = 0, instruments: int = 1) ->
     largest_rate = _LARGEST_RATE * (agent.task.time_to_paper if agent.controller.network.scaled else 1.0)
     rate = largest_rate * 10 ** rng.uniform(-4.0, 0.0, count)
     q_DN, q_e = directions(rng, count, 4), jax.vmap(rotations.from_axis_angle)(directions(rng, count, 3), angle)
-    zones = exported_zone_count(agent.controller.network, limits)
+    zones = exported_zone_count(agent.controller.network, limits, least_zones)
     half_angle = np.deg2rad(rng.uniform(limits.min_half_angle_deg, limits.max_half_angle_deg, (count, zones)))
     half_angle[:, 1:][rng.uniform(size=(count, zones - 1)) < _ABSENT] = ABSENT_HALF_ANGLE
     drawn = Situation(

@@ -82,6 +82,8 @@ class Metadata(Settings):
     """What depends on the momentum of reaction wheels; empty where there are none."""
     further_instruments: tuple[Instrument, ...] = ()
     """Those whose zones are told by the numbers 1, 2, ...; number 0 is ``boresight_B``, with ``scaling``."""
+    least_zones: int = 0
+    """C is told of so many zones at least, also where the policy sees fewer."""
 
     @property
     def boresights_B(self) -> tuple[Vector, ...]:
@@ -90,7 +92,7 @@ class Metadata(Settings):
 
     def to_json(self, indent: int | None = None) -> str:
         """What exported files hold."""
-        unused = {name for name in ("scaling", "wheels", "further_instruments") if not getattr(self, name)}
+        unused = {name for name in ("scaling", "wheels", "further_instruments", "least_zones") if not getattr(self, name)}
         return self.model_dump_json(indent=indent, exclude=unused)
 
 
@@ -99,6 +101,7 @@ def describe(
     task: TaskConfig | None = None,
     urgency: float = 0.5,
     further_boresights: Sequence[Vector] = (),
+    least_zones: int = 0,
 ) -> Metadata:
     """Metadata of a policy.
 
@@ -107,6 +110,7 @@ def describe(
         task: with the spacecraft that it is exported for, by default its own.
         urgency: where none is set, of a policy that sees one.
         further_boresights: unit vectors (3,) in body axes, of the spacecraft's instruments after the first.
+        least_zones: zones that C is told of at least.
 
     Raises:
         SettingsError: the spacecraft has gyros, or several instruments and the policy is not for any spacecraft.
@@ -140,6 +144,7 @@ def describe(
             Instrument(boresight_B=boresight, scaling=_scaling(task, urgency, boresight))
             for boresight in further_boresights
         ),
+        least_zones=least_zones,
     )
 
 

@@ -66,12 +66,18 @@ def _variants() -> list[_Variant]:
 
 
 def shield_golden(
-    agent: Agent, config: ShieldConfig, count: int, seed: int = 0, further_boresights: Sequence[Vector] = ()
+    agent: Agent,
+    config: ShieldConfig,
+    count: int,
+    seed: int = 0,
+    further_boresights: Sequence[Vector] = (),
+    least_zones: int = 0,
 ) -> ShieldGolden:
     """Draw situations and requests; of every kind, passed and not, about as many, as far as there are.
 
     Where other roundings could decide otherwise, as they do with a margin, a rate or an attitude that is a little
-    different, none is kept.  further_boresights: unit vectors (3,) in body axes, of instruments beside the task's own.
+    different, none is kept.  further_boresights: unit vectors (3,) in body axes, of instruments beside the task's own;
+    least_zones: so many are told at least.
 
     Raises:
         SettingsError: there is no torque for what the shield is to withstand.
@@ -81,7 +87,7 @@ def shield_golden(
     config.check(agent.task.spacecraft.brake_limits)
     model, boresights_B = known(agent, further_boresights)
     made = shield.from_config(config, model)
-    drawn, kind = shield_situations(agent, config, _DRAWN_PER_VECTOR * count, seed, further_boresights)
+    drawn, kind = shield_situations(agent, config, _DRAWN_PER_VECTOR * count, seed, further_boresights, least_zones)
     box = np.random.default_rng(seed).uniform(np.negative(limits), limits, (_DRAWN_PER_VECTOR * count, 3))
     left = np.asarray(_left(drawn, model, boresights_B))
     requested = np.clip(box.astype(np.float32), -left, left)
@@ -98,7 +104,12 @@ def shield_golden(
 
 
 def shield_situations(
-    agent: Agent, config: ShieldConfig, count: int, seed: int = 0, further_boresights: Sequence[Vector] = ()
+    agent: Agent,
+    config: ShieldConfig,
+    count: int,
+    seed: int = 0,
+    further_boresights: Sequence[Vector] = (),
+    least_zones: int = 0,
 ) -> tuple[Situation, np.ndarray]:
     """Draw situations of all kinds.  Returns leaves (count, ...), and the kinds (count,).
 
@@ -106,7 +117,7 @@ def shield_situations(
     step.
     """
     rng = np.random.default_rng(seed)
-    drawn = situations(agent, count, seed, 1 + len(further_boresights))
+    drawn = situations(agent, count, seed, 1 + len(further_boresights), least_zones)
     model, boresights_B = known(agent, further_boresights)
     made = shield.from_config(config, model)
     kind = np.resize(_KINDS, count)

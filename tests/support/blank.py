@@ -13,24 +13,26 @@ from koz_jax.export.shield_golden import ShieldGolden
 from koz_jax.task.observation_layout import size
 
 
-def _entries(agent: Agent, further: int) -> int:
+def _entries(agent: Agent, further: int, least_zones: int) -> int:
     """Numbers of a situation."""
-    zones = exported_zone_count(agent.controller.network, agent.task.scenario)
+    zones = exported_zone_count(agent.controller.network, agent.task.scenario, least_zones)
     return 11 + (5 if further else 4) * zones + len(agent.task.spacecraft.wheels)
 
 
-def golden(agent: Agent, count: int, further_boresights: Sequence[Vector] = ()) -> Golden:
+def golden(
+    agent: Agent, count: int, further_boresights: Sequence[Vector] = (), least_zones: int = 0
+) -> Golden:
     """In place of ``export.golden.golden``."""
     network, wheels = agent.controller.network, len(agent.task.spacecraft.wheels)
     memory = 4 + network.scaled + 3 * bool(wheels) + bool(further_boresights)
     seen = size(network.observed_zones, network.scaled)
-    entries = _entries(agent, len(further_boresights))
+    entries = _entries(agent, len(further_boresights), least_zones)
     return Golden(*(np.zeros((count, each), np.float32) for each in (entries, memory, seen, 3, 3, wheels)))
 
 
 def shield_golden(
-    agent: Agent, config: ShieldConfig, count: int, further_boresights: Sequence[Vector] = ()
+    agent: Agent, config: ShieldConfig, count: int, further_boresights: Sequence[Vector] = (), least_zones: int = 0
 ) -> ShieldGolden:
     """In place of ``export.shield_golden.shield_golden``."""
-    torques, entries = np.zeros((count, 3), np.float32), _entries(agent, len(further_boresights))
+    torques, entries = np.zeros((count, 3), np.float32), _entries(agent, len(further_boresights), least_zones)
     return ShieldGolden(np.zeros((count, entries), np.float32), torques, torques, np.zeros(count, bool))

@@ -24,7 +24,8 @@ def c_files(policy: NumpyPolicy, metadata: Metadata, vectors: Golden, example: n
     example: the situation in which the example's maneuver starts, a row as in ``Golden``.
     """
     seen, spacecraft = metadata.network, metadata.task.spacecraft
-    zones, wheel_count = exported_zone_count(seen, metadata.task.scenario), len(spacecraft.wheels)
+    zones = exported_zone_count(seen, metadata.task.scenario, metadata.least_zones)
+    wheel_count = len(spacecraft.wheels)
     replacements = {
         **observation.replacements(metadata, vectors),
         **wheels.replacements(spacecraft, vectors),

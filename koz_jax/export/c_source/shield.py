@@ -22,7 +22,8 @@ def shield_files(metadata: Metadata, config: ShieldConfig, vectors: ShieldGolden
     """Header, source and self-test of a shield for the spacecraft of an exported policy, by file name."""
     model = environment.model_from_config(metadata.task)
     made = shield.from_config(config, model)
-    zones, wheels = exported_zone_count(metadata.network, metadata.task.scenario), len(metadata.task.spacecraft.wheels)
+    zones = exported_zone_count(metadata.network, metadata.task.scenario, metadata.least_zones)
+    wheels = len(metadata.task.spacecraft.wheels)
     replacements = {
         "MARGIN_DEG": f"{np.rad2deg(made.margin):.4g}",
         "MAX_RATE_DEG": _largest_rate(model, wheels),
