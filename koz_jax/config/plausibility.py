@@ -6,9 +6,8 @@ import logging
 import math
 from typing import NamedTuple
 
-import numpy as np
-
-from koz_jax.config.task import SpacecraftConfig, TaskConfig
+from koz_jax.config.actuators.agility import Agility, agilities, rate_at_start
+from koz_jax.config.task import TaskConfig
 from koz_jax.config.training import TrainConfig
 from koz_jax.errors import SettingsError
 
@@ -23,34 +22,6 @@ class Finding(NamedTuple):
 
     text: str  # names the setting and the number
     hopeless: bool  # nothing can be learned; otherwise it is only suspicious
-
-
-class Agility(NamedTuple):
-    """How fast a body can turn about one of its principal axes."""
-
-    moment: float  # [kg m^2]
-    torque: float  # [N m]
-
-    @property
-    def acceleration(self) -> float:
-        """Largest angular acceleration [rad/s^2]."""
-        return self.torque / self.moment
-
-    def turn_seconds(self, angle_deg: float) -> float:
-        """Least time [s] of a turn by an angle from rest to rest: 2 sqrt(pi J / u) for 180 deg."""
-        return 2.0 * math.sqrt(math.radians(angle_deg) / self.acceleration)
-
-    def __str__(self) -> str:
-        return f"{self.moment:.3g} kg m^2, {self.torque:.3g} N m"
-
-
-def agilities(spacecraft: SpacecraftConfig) -> list[Agility]:
-    """Agility about each principal axis, the slowest first."""
-    moments, axes_B = np.linalg.eigh(np.array(spacecraft.inertia))
-    shares = np.maximum(np.abs(axes_B), 1e-12) / np.array(spacecraft.torque_limits)[:, None]
-    torques = 1.0 / shares.max(axis=0)  # the longest torque along the axis that is in the box
-    found = [Agility(float(moment), float(torque)) for moment, torque in zip(moments, torques, strict=True)]
-    return sorted(found, key=lambda agility: agility.acceleration)
 
 
 def findings(task: TaskConfig, min_angle_deg: float, max_angle_deg: float) -> list[Finding]:
@@ -68,6 +39,7 @@ def findings(task: TaskConfig, min_angle_deg: float, max_angle_deg: float) -> li
                 )
             )
             break
+    found += _too_slow(task, slowest, max_angle_deg) if not found else []
     per_step = quickest.acceleration * task.step_seconds**2
     if per_step > MAX_TURN_PER_STEP:
         found.append(
@@ -79,6 +51,22 @@ def findings(task: TaskConfig, min_angle_deg: float, max_angle_deg: float) -> li
             )
         )
     return [*found, *_undrawn(task, max_angle_deg)]
+
+
+def _too_slow(task: TaskConfig, slowest: Agility, angle_deg: float) -> list[Finding]:
+    """A turn that takes too long at the largest rate; not all controllers keep one, so that something can be learned."""
+    rate = rate_at_start(task.spacecraft)
+    least = slowest.turn_seconds(angle_deg, rate)
+    if least <= task.episode_seconds:
+        return []
+    what = "max_rate_deg" if task.spacecraft.max_rate_deg is not None else "what its actuators can stop"
+    return [
+        Finding(
+            f"task.spacecraft: a turn by {angle_deg:g} deg takes {least:.3g} s or more at {math.degrees(rate):.3g} deg/s,"
+            f" the largest rate ({what}), and episode_seconds is {task.episode_seconds:g}",
+            False,
+        )
+    ]
 
 
 def _undrawn(task: TaskConfig, max_angle_deg: float) -> list[Finding]:

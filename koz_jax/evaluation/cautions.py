@@ -6,8 +6,10 @@ import numpy as np
 import numpy.typing as npt
 
 from koz_jax.config import plausibility
+from koz_jax.config.actuators.agility import rate_at_start
 from koz_jax.config.filters import FilterConfig
 from koz_jax.config.monte_carlo import MonteCarloConfig
+from koz_jax.config.presets.named import preset
 from koz_jax.config.task import TaskConfig
 from koz_jax.control.base import TaskController
 from koz_jax.control.policy import PolicyController
@@ -19,6 +21,9 @@ _log = logging.getLogger(__name__)
 
 # [deg] In float32, two directions are known to about this.
 _ROUNDING_DEG = 0.01
+
+# By this factor steps and rates may be outside of what was trained without a word.
+_SLACK = 1.2
 
 
 def warn_of_task(agent: TaskController, task: TaskConfig, config: MonteCarloConfig) -> None:
@@ -37,7 +42,8 @@ def warn_of_differences(agent: TaskController, task: TaskConfig) -> None:
     """Warn, in one line, of all in which a task differs from the one that an agent was trained for."""
     if not isinstance(agent.controller, PolicyController):
         return
-    found = [] if agent.controller.network.scaled else differences(agent.task, task)
+    scaled = agent.controller.network.scaled
+    found = outside_of_training(agent.task, task) if scaled else differences(agent.task, task)
     seen = agent.controller.network.observed_zones
     if seen < task.zones[1]:
         nearest = "the nearest zone" if seen == 1 else f"the nearest {seen} zones"
@@ -68,6 +74,28 @@ def differences(made_for: TaskConfig, flown: TaskConfig) -> list[str]:
         for form, now, then in pairs
         if not np.allclose(now, then, rtol=1e-6, atol=1e-9)
     ]
+
+
+def outside_of_training(made_for: TaskConfig, flown: TaskConfig) -> list[str]:
+    """Name what of a task is outside of what agents for any spacecraft are trained with, in units of the spacecraft.
+
+    That is what the preset ``universal`` spreads, since an agent does not keep what its own training spread; and the
+    task that it was made for, which for an agent of ``koz train --spacecraft`` is that spacecraft's.
+    """
+    if flown.spread.spacecraft:  # steps are drawn
+        return []
+    trained = preset("universal").task
+    found, (shortest, longest) = [], trained.spread.step_shares
+    step, own_step = (task.step_seconds / task.spacecraft.time_unit for task in (flown, made_for))
+    if not min(shortest, own_step) / _SLACK <= step <= max(longest, own_step) * _SLACK:
+        found.append(f"a time step of {step:.2g} T in place of {shortest:g} to {longest:g}")
+    rate, own_rate = (rate_at_start(task.spacecraft) * task.spacecraft.time_unit for task in (flown, made_for))
+    slowest = np.deg2rad((trained.spread.max_rate_deg or (0.0, 0.0))[0]) * trained.spacecraft.time_unit
+    if rate < min(slowest, own_rate) / _SLACK:
+        found.append(f"a largest rate of {rate:.2g} / T in place of {slowest:.2g} or more")
+    if found:
+        found[-1] += f" (T = sqrt(J / u) = {flown.spacecraft.time_unit:.3g} s)"
+    return found
 
 
 def _products(inertia: npt.ArrayLike) -> np.ndarray:

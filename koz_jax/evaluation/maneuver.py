@@ -140,9 +140,8 @@ def _worst(bodies: RigidBodyState, constraints: PointingConstraint, apart: jax.A
 def describe(maneuver: ManeuverConfig, flown: FlownManeuver) -> str:
     """What was chosen, the margins, and the result beside what is published, in lines."""
     lines = []
-    slowest = maneuver.spacecraft.half_turns[0]
     if maneuver.duration_seconds is None:
-        lines.append(f"flown for {maneuver.seconds:g} s: 5 times the fastest half turn, {slowest:.3g} s, in whole 10 s")
+        lines.append(f"flown for {maneuver.seconds:g} s: {maneuver.default_duration[1]}")
     if maneuver.target.direction is not None:
         chosen = f"rolled by {maneuver.aim.roll_deg:+.1f} deg, clear of all cones" if maneuver.aim.roll_deg else "as is"
         lines.append(f"target: the roll that the smallest rotation gives, {chosen}; attitude {_row(maneuver)}")

@@ -85,6 +85,34 @@ def test_lasts_five_half_turns_about_the_slowest_axis_in_whole_tens():
     assert made(duration_seconds=33.0).seconds == 33.0
 
 
+def test_lasts_two_half_turns_at_the_largest_rate_where_that_is_longer():
+    assert made(spacecraft={"max_rate_deg": 5.0}).seconds == 80.0
+    slow = made(spacecraft={"max_rate_deg": 0.5})
+    assert slow.default_duration == (720.0, "2 half turns at the largest rate, 0.5 deg/s, in whole 10 s")
+    assert slow.cautions == []
+    # Of wheels by what they hold: 0.001 N m s on 0.06 kg m2.
+    wheels = [{"axis": axis, "max_torque": 0.004, "max_momentum": 0.001} for axis in np.eye(3).tolist()]
+    on_wheels = made(spacecraft={"torque_limit": None, "wheels": wheels})
+    assert on_wheels.seconds == 10.0 * np.ceil(0.2 * np.pi / (0.001 / 0.06))
+    full = [wheel | {"momentum": 0.001} for wheel in wheels]
+    assert made(spacecraft={"torque_limit": None, "wheels": full}).seconds == 7200.0
+
+
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({}, []),
+        ({"spacecraft": {"max_rate_deg": 0.5}}, ["the turn by 120 deg takes 240 s or more", "at up to 0.5 deg/s"]),
+        ({"spacecraft": {"torque_limit": 0.00002}}, ["is 100, and the turn by 120 deg", "0.0433 kg m^2"]),
+        ({"duration_seconds": 3.0}, ["duration_seconds: is 3, and the turn"]),
+        ({"target": {"attitude": (1.0, 0.0, 0.0, 0.0)}, "duration_seconds": 1.0}, []),
+    ],
+)
+def test_a_maneuver_that_is_too_short_for_its_turn_is_cautioned_of(changes, words):
+    cautions = made(**({"duration_seconds": 100.0} | changes)).cautions
+    assert len(cautions) == bool(words) and all(word in cautions[0] for word in words)
+
+
 def test_errors_become_what_is_flown_with():
     found = made(errors={"inertia": 0.1, "disturbance_torque": 1e-6, "attitude_noise_deg": 0.01, "delay_steps": 2})
     assert found.has_errors

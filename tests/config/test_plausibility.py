@@ -5,12 +5,17 @@ import math
 
 import numpy as np
 import pytest
+from support.tiny import MANEUVER_FILES
 
 from koz_jax.agents.record import read_agent_record, shipped_agents, shipped_folder
 from koz_jax.config import plausibility
+from koz_jax.config.actuators.agility import Agility, about, agilities, rate_at_start
+from koz_jax.config.maneuvers.maneuver_file import load_maneuver
 from koz_jax.config.presets.named import PRESETS, preset
 from koz_jax.config.task import SpacecraftConfig, TaskConfig
 from koz_jax.errors import SettingsError
+from koz_jax.task.environment import model_from_config
+from koz_jax.task.state import nominal_rate
 
 INERTIA = ((60.0, 5.0, 1.0), (5.0, 50.0, 2.0), (1.0, 2.0, 70.0))
 CUBESAT = {"inertia": ((0.05, 0.0, 0.0), (0.0, 0.06, 0.0), (0.0, 0.0, 0.02)), "torque_limit": 0.004}
@@ -103,7 +108,7 @@ def test_a_half_angle_that_is_never_drawn_is_told():
 
 def test_the_fastest_turn_is_that_of_a_bang_bang_torque():
     """Half the way with full torque, half against it, integrated; about an axis that is not a body axis too."""
-    agility = plausibility.Agility(moment=50.0, torque=2.0)
+    agility = Agility(moment=50.0, torque=2.0)
     seconds = agility.turn_seconds(180.0)
     assert seconds == pytest.approx(2.0 * math.sqrt(math.pi * 50.0 / 2.0))
     times = np.linspace(0.0, seconds, 100_001)
@@ -113,5 +118,31 @@ def test_the_fastest_turn_is_that_of_a_bang_bang_torque():
     body = turned @ np.diag([1.0, 2.0, 2.5]) @ turned.T
     spacecraft = SpacecraftConfig.model_validate({"inertia": body.tolist(), "torque_limit": 1.0})
     # Along a diagonal of two axes the box holds sqrt(2) times the torque.
-    found = {round(agility.moment, 6): agility.torque for agility in plausibility.agilities(spacecraft)}
+    found = {round(agility.moment, 6): agility.torque for agility in agilities(spacecraft)}
     assert found == pytest.approx({1.0: math.sqrt(2), 2.0: math.sqrt(2), 2.5: 1.0})
+    for moment, axis_B in zip((1.0, 2.0, 2.5), turned.T, strict=True):
+        assert about(spacecraft, axis_B) == pytest.approx((moment, found[moment]))
+
+
+def test_a_turn_at_a_largest_rate_speeds_up_coasts_and_brakes():
+    agility, rate = Agility(moment=50.0, torque=2.0), math.radians(0.5)
+    assert agility.turn_seconds(120.0, rate) == pytest.approx(240.0 + rate / agility.acceleration)
+    fastest = math.sqrt(math.pi * agility.acceleration)  # in the middle of a half turn
+    assert agility.turn_seconds(180.0, fastest) == pytest.approx(agility.turn_seconds(180.0))
+    assert agility.turn_seconds(180.0, 2.0 * fastest) == agility.turn_seconds(180.0)
+    assert agility.turn_seconds(180.0, 0.0) == math.inf
+
+
+@pytest.mark.parametrize("name", ["leo_6u", "cmg_smallsat", "minxss_3u", "cubesat_6u"])
+def test_the_largest_rate_is_what_the_actuators_say_at_the_start(name):
+    own = load_maneuver(MANEUVER_FILES[name]).task.spacecraft
+    start = nominal_rate(model_from_config(TaskConfig(spacecraft=own)))
+    assert rate_at_start(own) == pytest.approx(math.inf if start is None else float(start), rel=1e-4)
+
+
+def test_a_turn_that_takes_too_long_at_the_largest_rate_is_told_and_not_refused(caplog):
+    """Not all controllers keep it, so that something may be learned."""
+    with caplog.at_level(logging.WARNING):
+        plausibility.check(task(max_rate_deg=0.5), 80.0, 180.0)
+    (record,) = caplog.records
+    assert "a turn by 180 deg takes 360 s or more at 0.5 deg/s, the largest rate (max_rate_deg)" in record.getMessage()

@@ -1,5 +1,6 @@
 """What an agent was not made for is said, once and by name; what it was made for passes in silence."""
 
+import dataclasses
 import logging
 
 import jax.numpy as jnp
@@ -63,6 +64,32 @@ def test_its_own_task_or_an_easier_one_is_not_told(said):
     seeing = tiny.untrained_agent(network=NetworkConfig(hidden_sizes=(4,), observed_zones=3))
     cautions.warn_of_differences(seeing, changed(scenario={"max_zones": 3}))
     cautions.warn_of_differences(load_controller("pd", OWN), changed(step_seconds=0.5))  # made for no task
+    assert said() == []
+
+
+SCALED = tiny.untrained_agent(network=NetworkConfig(hidden_sizes=(4,), scaled=True))
+OWN_UNIT = OWN.spacecraft.time_unit
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"step_seconds": 0.25 * OWN_UNIT}, ["a time step of 0.25 T in place of 0.016 to 0.06 (T = sqrt(J / u) = 5.48 s)"]),
+        ({"step_seconds": 0.01 * OWN_UNIT}, ["a time step of 0.01 T in place of 0.016 to 0.06"]),
+        ({"spacecraft": {"max_rate_deg": 0.5}}, ["a largest rate of 0.048 / T in place of 0.19 or more"]),
+        ({"step_seconds": 0.03 * OWN_UNIT, "spacecraft": {"max_rate_deg": 3.0}}, []),
+        ({"spacecraft": {"inertia": ((6.0, 0.0, 0.0), (0.0, 5.0, 0.0), (0.0, 0.0, 9.0))}}, []),
+    ],
+)
+def test_an_agent_for_any_spacecraft_is_told_by_steps_and_rates_in_units_of_it(said, changes, words):
+    cautions.warn_of_differences(SCALED, changed(**changes))
+    lines = said()
+    assert len(lines) == bool(words) and all(word in lines[0] for word in words)
+
+
+def test_an_agent_for_any_spacecraft_that_was_made_for_one_step_is_silent_on_it(said):
+    slow = changed(step_seconds=0.2 * OWN_UNIT, spacecraft={"max_rate_deg": 0.5})
+    cautions.warn_of_differences(dataclasses.replace(SCALED, task=slow), slow)
     assert said() == []
 
 

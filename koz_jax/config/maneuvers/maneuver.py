@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import model_validator
 
 from koz_jax.config import attitudes
+from koz_jax.config.actuators import agility
 from koz_jax.config.base import PositiveFloat, check_steps
 from koz_jax.config.maneuvers.maneuver_tables import (
     BodyConfig,
@@ -25,12 +26,16 @@ from koz_jax.config.maneuvers.maneuver_tables import (
 )
 from koz_jax.config.task import RewardConfig, TaskConfig
 
-# A maneuver lasts so many half turns unless it says otherwise, in whole tens of seconds.
-_HALF_TURNS, _WHOLE_SECONDS = 5, 10.0
+# A maneuver lasts so many half turns by full torque unless it says otherwise, and at least so many at the largest rate;
+# in whole tens of seconds.  An hour for one at the largest rate is the most that is waited for.
+_HALF_TURNS, _HALF_TURNS_AT_RATE, _WHOLE_SECONDS, _LONGEST_SECONDS = 5, 2, 10.0, 3600.0
 
 # Where the roll is free and the smallest rotation ends inside a constraint: rolls that are tried, and how far from
 # every constraint they must end.  The shield keeps less.
 _ROLL_STEP_DEG, _ROLL_CLEARANCE_DEG = 0.1, 0.25
+
+# A turn whose half angle has a sine below it is none.
+_NO_TURN = 1e-9
 
 # Half angles below it are rather radians: pi / 2 and less.
 _RADIANS_BELOW = 1.6
@@ -52,7 +57,8 @@ class ManeuverConfig(Table):
     step_seconds: PositiveFloat
     """Time step; the torque is held over it [s]."""
     duration_seconds: PositiveFloat | None = None
-    """How long it is flown [s]; by default five times the fastest half turn about the slowest axis, in whole tens."""
+    """How long it is flown [s]; by default five times the fastest half turn about the slowest axis, or two half turns at
+    the largest rate where that is longer, in whole tens."""
     settled_angle_deg: PositiveFloat = RewardConfig().settled_angle_deg
     """Settled is what stays within this angle of the target [deg]."""
     source: str = ""
@@ -172,9 +178,18 @@ class ManeuverConfig(Table):
     @property
     def seconds(self) -> float:
         """How long it is flown [s]."""
-        if self.duration_seconds is not None:
-            return self.duration_seconds
-        return float(_WHOLE_SECONDS * np.ceil(_HALF_TURNS * self.spacecraft.half_turns[0] / _WHOLE_SECONDS))
+        return self.default_duration[0] if self.duration_seconds is None else self.duration_seconds
+
+    @property
+    def default_duration(self) -> tuple[float, str]:
+        """How long it is flown where nothing is said [s], and why."""
+        half_turn, rate = self.spacecraft.half_turns[0], self.spacecraft.largest_rate
+        by_rate = min(np.pi / rate, _LONGEST_SECONDS) if rate > 0.0 else _LONGEST_SECONDS
+        seconds, why = _HALF_TURNS * half_turn, f"{_HALF_TURNS} times the fastest half turn, {half_turn:.3g} s"
+        if _HALF_TURNS_AT_RATE * by_rate > seconds:
+            seconds = _HALF_TURNS_AT_RATE * by_rate
+            why = f"{_HALF_TURNS_AT_RATE} half turns at the largest rate, {np.rad2deg(rate):.3g} deg/s"
+        return float(_WHOLE_SECONDS * np.ceil(seconds / _WHOLE_SECONDS)), f"{why}, in whole {_WHOLE_SECONDS:g} s"
 
     @property
     def task(self) -> TaskConfig:
@@ -191,6 +206,28 @@ class ManeuverConfig(Table):
     @property
     def cautions(self) -> list[str]:
         """What is allowed and looks wrong, each in a line."""
+        return [*self._small_cones, *self._short_of_time]
+
+    @property
+    def _short_of_time(self) -> list[str]:
+        """Whether the turn takes longer than it is flown, at full torque and the largest rate."""
+        turn = attitudes.multiply(np.array([1.0, -1.0, -1.0, -1.0]) * self.start.attitude, np.array(self.aim.attitude))
+        sine, rate = float(np.linalg.norm(turn[1:])), self.spacecraft.largest_rate
+        if sine < _NO_TURN:
+            return []
+        angle_deg = float(np.rad2deg(2.0 * np.arctan2(sine, abs(turn[0]))))
+        turning = agility.about(self.task.spacecraft, turn[1:] / sine)
+        least = turning.turn_seconds(angle_deg, rate)
+        if least <= self.seconds:
+            return []
+        limited = f", at up to {np.rad2deg(rate):.3g} deg/s" if np.isfinite(rate) else ""
+        return [
+            f"duration_seconds: is {self.seconds:g}, and the turn by {angle_deg:.3g} deg takes {least:.3g} s or more"
+            f" ({turning}{limited})"
+        ]
+
+    @property
+    def _small_cones(self) -> list[str]:
         return [
             f"constraints.{i}.half_angle_deg: {one.half_angle_deg:g} deg is small; is it {one.half_angle_deg:g} rad ="
             f" {np.rad2deg(one.half_angle_deg):.1f} deg?"

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import AfterValidator, ValidationError, model_validator
 
 from koz_jax.config import attitudes
+from koz_jax.config.actuators import agility
 from koz_jax.config.actuators.gyros import PyramidConfig
 from koz_jax.config.actuators.wheels import WheelConfig
 from koz_jax.config.base import (
@@ -137,6 +138,11 @@ class BodyConfig(Table):
         limits = np.array(self.spacecraft((1.0, 0.0, 0.0)).torque_limits)
         seconds = 2.0 * np.sqrt(np.pi * np.diag(self.inertia) / limits)
         return float(seconds.max()), float(seconds.min())
+
+    @property
+    def largest_rate(self) -> float:
+        """Largest rate that is allowed and can be stopped, at the start [rad/s]; infinite where there is no limit."""
+        return agility.rate_at_start(self.spacecraft((1.0, 0.0, 0.0)))
 
 
 class InstrumentConfig(Table):

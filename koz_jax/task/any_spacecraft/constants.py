@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from koz_jax.config.actuators.agility import rate_at_start
 from koz_jax.config.task import SpacecraftConfig
 from koz_jax.errors import SettingsError
 from koz_jax.task import host
-from koz_jax.task.any_spacecraft.host_wheels import HostWheels
 from koz_jax.task.host import Floats
 from koz_jax.task.observation_layout import FREE_RATE, FULL_ACTION, LEAST_RATE, SHORTEST_STEP
 
@@ -49,7 +49,7 @@ def of(spacecraft: SpacecraftConfig, step_seconds: float, boresight: npt.ArrayLi
         "inertia": np.array([*np.diag(tensor), tensor[0, 1], tensor[0, 2], tensor[1, 2]]),
         "reach": np.min(limits / np.maximum(np.abs(axes), 1e-6), axis=1) / torque,
         "step": np.log([max(step_seconds / (time * SHORTEST_STEP), 1.0)]),
-        "rate_limit": seen_rate(_largest_rate(spacecraft), time),
+        "rate_limit": seen_rate(rate_at_start(spacecraft), time),
     }
     return Constants(time, inertia, torque, axes, seen, FULL_ACTION * torque / inertia * inertia_B @ axes.T, limits)
 
@@ -57,14 +57,6 @@ def of(spacecraft: SpacecraftConfig, step_seconds: float, boresight: npt.ArrayLi
 def seen_rate(largest: float, time: float) -> Floats:
     """Part of the observation that a largest rate [rad/s] is, with the unit of time [s].  Returns (1,)."""
     return np.log([np.clip(largest * time / FREE_RATE, LEAST_RATE, 1.0)])
-
-
-def _largest_rate(spacecraft: SpacecraftConfig) -> float:
-    """At the start, at rest [rad/s]."""
-    if spacecraft.wheels:
-        wheels = HostWheels(spacecraft)
-        return wheels.largest_rate(wheels.momentum_at_start, np.zeros(3))
-    return np.inf if spacecraft.max_rate_deg is None else float(np.deg2rad(spacecraft.max_rate_deg))
 
 
 def policy_axes(boresight_B: Floats) -> Floats:
