@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +15,7 @@ from koz_jax.cli.flags import parsing
 from koz_jax.cli.flags.flight import AgentFlags, FlightFlags
 from koz_jax.cli.flags.process import ProcessFlags
 from koz_jax.cli.flags.suite import SUITE, SuiteFlags
-from koz_jax.config.maneuvers.maneuver_file import load_spacecraft
+from koz_jax.config.maneuvers.maneuver_file import SpacecraftFile, load_spacecraft
 from koz_jax.config.spread import SpreadConfig
 from koz_jax.config.task import TaskConfig
 from koz_jax.errors import SettingsError
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from koz_jax.evaluation.monte_carlo import MonteCarlo
     from koz_jax.evaluation.rollout import History
 
+_log = logging.getLogger(__name__)
 
 # Another spacecraft in every case.
 _ANY_SPACECRAFT = TaskConfig(spread=SpreadConfig(spacecraft=True))
@@ -66,8 +68,26 @@ class EvaluateFlags(ProcessFlags, FlightFlags, AgentFlags):
         """
         if self.spacecraft is None:
             return super().task(agent)
-        return super().changed(
-            _ANY_SPACECRAFT if self.spacecraft == "random" else load_spacecraft(self.spacecraft).task
+        if self.spacecraft == "random":
+            return super().changed(_ANY_SPACECRAFT)
+        described = load_spacecraft(self.spacecraft)
+        if self.process == 0:
+            _tell_of_the_draw(self.spacecraft, described)
+        return super().changed(described.task)
+
+
+def _tell_of_the_draw(path: str, described: SpacecraftFile) -> None:
+    """Log a warning of what a file has and a draw does not fly."""
+    left_out = []
+    if len(described.instruments) > 1:
+        left_out.append("other instruments")
+    if described.constraints:
+        left_out.append(f"{len(described.constraints)} constraints")
+    if left_out:
+        drawn_for = f" for its first instrument, {described.instruments[0].name!r}" if described.instruments else ""
+        _log.warning(
+            "spacecraft: zones are drawn at random%s; %s of %s are not flown (%s does)",
+            *(drawn_for, " and ".join(left_out), path, invocation.command("fly")),
         )
 
 

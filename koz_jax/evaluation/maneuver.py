@@ -95,6 +95,7 @@ def unfamiliar(agent: TaskController, maneuver: ManeuverConfig) -> list[str]:
         return []
     found = cautions.differences(agent.task, maneuver.task)
     looks = {tuple(maneuver.boresight(one.instrument).tolist()) for one in maneuver.constraints}
+    looks.add(maneuver.task.spacecraft.boresight)
     return [*found, f"{len(looks)} instruments in place of one"] if len(looks) > 1 else found
 
 

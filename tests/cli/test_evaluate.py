@@ -309,6 +309,8 @@ def test_a_named_agent_of_one_spacecraft_is_flown_on_another_and_does_not_hurry(
     told = capsys.readouterr()
     assert "phase2" in told.out and "universal" not in told.out
     assert "phase2 was not made for this: " in told.err
+    drawn = "zones are drawn at random for its first instrument, 'telescope'; 1 constraints of"
+    assert sum(drawn in line for line in told.err.splitlines()) == 1
     assert "urgency: phase2 was trained for one trade" in refused(capsys, "--agent", "phase2", "--urgency", 0.8)
 
 

@@ -415,6 +415,21 @@ def test_no_constraints_and_no_instruments_are_a_maneuver_too():
 # --- a spacecraft alone ---
 
 
+@pytest.mark.parametrize("another", [False, True])
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_the_first_instrument_is_that_of_flights_and_of_draws(path, another, tmp_path):
+    """Whatever constraints there are."""
+    text = path.read_text()
+    if another:
+        first, _, rest = text.partition("[[instruments]]")
+        text = f"{first}[[instruments]]\nname = 'new'\nboresight = [0, -0.6, 0.8]\n[[instruments]]{rest}"
+    flown, drawn = load_maneuver(written(tmp_path, text)), load_spacecraft(written(tmp_path, text))
+    expected = flown.instruments[0].boresight
+    assert flown.task.spacecraft.boresight == expected == drawn.task.spacecraft.boresight
+    if not another:  # published flights are of the first constraint's instrument too
+        assert flown.constraints[0].instrument == flown.instruments[0].name
+
+
 def test_a_maneuver_file_will_do_for_its_spacecraft(tmp_path):
     found = load_spacecraft(written(tmp_path, TEXT))
     assert found.spacecraft.torque_limit == 0.004 and found.step_seconds == 0.2

@@ -206,6 +206,9 @@ def test_several_instruments_are_more_than_an_agent_was_made_for():
     )
     assert maneuver.unfamiliar(load_for(PAPER), both) == ["2 instruments in place of one"]
     assert maneuver.unfamiliar(load_controller("planner"), both) == []
+    (camera,) = PAPER.instruments
+    other = changed("paper", instruments=[camera.model_dump(), {"name": "tracker", "boresight": (0, 1, 0)}])
+    assert maneuver.unfamiliar(load_for(PAPER), other) == []  # it has no constraint
 
 
 def test_names_and_objects_can_fly():

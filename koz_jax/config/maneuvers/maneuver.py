@@ -193,11 +193,10 @@ class ManeuverConfig(Table):
 
     @property
     def task(self) -> TaskConfig:
-        """What is flown, as settings of a task; its instrument is that of the first constraint."""
-        named = [one.instrument for one in self.constraints] or [one.name for one in self.instruments]
-        x, y, z = self.boresight(named[0]).tolist() if named else (1.0, 0.0, 0.0)
+        """What is flown, as settings of a task; its instrument is the first, as of ``SpacecraftFile``."""
+        boresight = self.instruments[0].boresight if self.instruments else (1.0, 0.0, 0.0)
         return TaskConfig(
-            spacecraft=self.spacecraft.spacecraft((x, y, z)),
+            spacecraft=self.spacecraft.spacecraft(boresight),
             reward=RewardConfig(settled_angle_deg=self.settled_angle_deg),
             step_seconds=self.step_seconds,
             episode_seconds=self.seconds,
