@@ -18,6 +18,9 @@ from koz_jax.errors import SettingsError, explain
 # More cones of 15 to 30 deg, with gaps, hardly find room on half a sphere.
 MAX_ZONES = 8
 
+# Half angles [deg] below it are rather radians: pi / 2 and less.
+_RADIANS_BELOW = 1.6
+
 PositiveFloat = Annotated[float, Field(gt=0)]
 NonNegativeFloat = Annotated[float, Field(ge=0)]
 # Counts are int32 on the device, and so are the bits of a seed.
@@ -49,6 +52,13 @@ def check_unit(name: str, vector: Vector) -> None:
     length = float(np.linalg.norm(vector))
     if abs(length - 1.0) > 1e-6:
         raise ValueError(f"{name} must be a unit vector; {vector} has length {length:.6g}")
+
+
+def doubt_of_degrees(half_angle_deg: float) -> str:
+    """Say of a half angle [deg] that it is rather one in radians; empty where it is not."""
+    if half_angle_deg >= _RADIANS_BELOW:
+        return ""
+    return f"{half_angle_deg:g} deg is small; is it {half_angle_deg:g} rad = {np.rad2deg(half_angle_deg):.1f} deg?"
 
 
 def check_steps(name: str, seconds: float, step_seconds: float) -> None:

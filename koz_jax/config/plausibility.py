@@ -6,7 +6,7 @@ import logging
 import math
 from typing import NamedTuple
 
-from koz_jax.config.actuators.agility import Agility, agilities, rate_at_start
+from koz_jax.config.actuators.agility import Agility, agilities, rate_at_start, senseless_momenta
 from koz_jax.config.task import TaskConfig
 from koz_jax.config.training import TrainConfig
 from koz_jax.errors import SettingsError
@@ -50,6 +50,7 @@ def findings(task: TaskConfig, min_angle_deg: float, max_angle_deg: float) -> li
                 False,
             )
         )
+    found += [Finding(f"task.spacecraft.{text}", False) for text in senseless_momenta(task.spacecraft)]
     return [*found, *_undrawn(task, max_angle_deg)]
 
 

@@ -61,7 +61,7 @@ def _number(value: npt.ArrayLike | None) -> float | None:
 
 def scenario(maneuver: ManeuverConfig) -> Scenario:
     """What is flown, in float32 arrays.  Without constraints there is one that is absent."""
-    return maneuvers.maneuver(
+    return maneuvers.of_numbers(
         maneuver.start.attitude,
         maneuver.aim.attitude,
         [_zone(maneuver, one) for one in maneuver.constraints],

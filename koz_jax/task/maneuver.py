@@ -11,6 +11,7 @@ import numpy.typing as npt
 from jax.core import Tracer
 
 from koz_jax.config import attitudes
+from koz_jax.config.base import doubt_of_degrees
 from koz_jax.errors import SettingsError
 from koz_jax.task import host
 from koz_jax.task.dynamics import RigidBodyState
@@ -29,7 +30,7 @@ def maneuver(
     boresight: npt.ArrayLike = (1.0, 0.0, 0.0),
     rate_deg: npt.ArrayLike = (0.0, 0.0, 0.0),
 ) -> Scenario:
-    """Make a maneuver to fly.
+    """Make a maneuver to fly.  A half angle that looks like one in radians is logged as a warning.
 
     Args:
         start: attitude at the start, (4,) scalar first; takes body components to inertial ones.
@@ -43,6 +44,28 @@ def maneuver(
     Raises:
         SettingsError: something is not finite, is zero or has another shape; a direction's or a quaternion's length is
             off 1 by more than 1 % (what is off by less is normalised); a half angle is not above 0 and below 180 deg.
+
+    """
+    made = of_numbers(start, target, zones, boresight=boresight, rate_deg=rate_deg)
+    for number, zone in enumerate(zones):
+        doubt = doubt_of_degrees(float(zone[1]))
+        if doubt:
+            _log.warning("zones[%d], half angle: %s", number, doubt)
+    return made
+
+
+def of_numbers(
+    start: npt.ArrayLike,
+    target: npt.ArrayLike,
+    zones: Sequence[Any],
+    *,
+    boresight: npt.ArrayLike,
+    rate_deg: npt.ArrayLike,
+) -> Scenario:
+    """``maneuver`` without a word, for what somebody has been told of before.
+
+    Raises:
+        SettingsError: as of ``maneuver``.
 
     """
     stack = host.cones(zones, boresight, turning=True)

@@ -173,6 +173,15 @@ def test_errors_come_from_the_file_or_from_flags_and_are_what_robust_withstands(
     assert parsed(PAPER, "--inertia-error", 0.2).config().uncertainty == UncertaintyConfig(inertia_error=0.2)
 
 
+def test_flags_in_radians_are_told_once(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cases, "_keep_and_evaluate", lambda *_, **__: pytest.fail("something was flown"))
+    argv = ["--from", *HALF, "--to", 1, 0, 0, 0, "--keep-out", 0, 1, 0, 0.5236, "--out", tmp_path]
+    with pytest.raises(pytest.fail.Exception):
+        tiny.status("fly", *argv)
+    told = capsys.readouterr().err
+    assert told.count("is it 0.5236 rad = 30.0 deg?") == 1 and "constraints.0.half_angle_deg: 0.5236 deg is small" in told
+
+
 TURN = ("--from", 1, 0, 0, 0, "--to", 0, 1, 0, 0)
 REFUSED_TURNS = {
     "no file": (("no.toml",), "maneuver: no.toml cannot be read: No such file or directory"),

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from support.tiny import MANEUVER_FILES, merged
 
-from koz_jax.config import attitudes
+from koz_jax.config import attitudes, plausibility
 from koz_jax.config.maneuvers.maneuver import ManeuverConfig
 from koz_jax.config.maneuvers.maneuver_file import load_maneuver, load_spacecraft
+from koz_jax.config.task import TaskConfig
 from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.errors import SettingsError
 from koz_jax.task import rotations
@@ -401,9 +402,24 @@ def test_files_that_are_none_are_refused(tmp_path):
 
 
 def test_half_angles_that_look_like_radians_are_told(tmp_path, caplog):
+    """Once, by a file and in Python."""
+    small = {"constraints": [{"instrument": "telescope", "direction": (0, 1, 0), "half_angle_deg": 0.5}]}
     with caplog.at_level(logging.WARNING, "koz_jax"):
         load_maneuver(written(tmp_path, CLEAR.replace("half_angle_deg = 20", "half_angle_deg = 0.5")))
-    assert "constraints.0.half_angle_deg: 0.5 deg is small; is it 0.5 rad = 28.6 deg?" in caplog.text
+        made(**small)
+    expected = "mine: constraints.0.half_angle_deg: 0.5 deg is small; is it 0.5 rad = 28.6 deg?"
+    assert [record.getMessage() for record in caplog.records] == [expected] * 2
+
+
+@pytest.mark.parametrize(("momentum", "told"), [(0.015, False), (0.2, False), (15.0, True), (50.0, True)])
+def test_wheels_that_hold_what_the_body_makes_no_use_of_are_cautioned_of(momentum, told):
+    """15 mN m s in mN m s, for one; the momentum that its fastest half turn takes is sqrt(pi J u), about 20 mN m s."""
+    wheels = [{"axis": axis, "max_torque": 0.004, "max_momentum": momentum} for axis in np.eye(3).tolist()]
+    found = made(spacecraft={"torque_limit": None, "wheels": wheels})
+    words = [f"spacecraft.wheels.{i}.max_momentum: {momentum:g} N m s would turn the body at" for i in range(3)]
+    assert [caution.startswith(word) for caution, word in zip(found.cautions, words * told, strict=True)] == [True] * 3 * told
+    task = TaskConfig(spacecraft=found.task.spacecraft, step_seconds=0.2)
+    assert sum("max_momentum" in finding.text for finding in plausibility.findings(task, 80.0, 180.0)) == 3 * told
 
 
 def test_no_constraints_and_no_instruments_are_a_maneuver_too():

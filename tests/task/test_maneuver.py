@@ -181,6 +181,13 @@ def test_a_start_or_a_target_inside_a_zone_is_told(start, target, told, caplog):
     assert [record.getMessage() for record in caplog.records] == expected
 
 
+def test_half_angles_that_look_like_radians_are_told(caplog):
+    with caplog.at_level(logging.WARNING, "koz_jax"):
+        koz_jax.maneuver((1.0, 0.0, 0.0, 0.0), zones=[((0, 1, 0), 20.0), ((0, 0, 1), 0.5236)])
+    expected = "zones[1], half angle: 0.5236 deg is small; is it 0.5236 rad = 30.0 deg?"
+    assert [record.getMessage() for record in caplog.records] == [expected]
+
+
 def test_zones_for_another_instrument_only_are_told(caplog):
     own = (0.0, 0.0, 1.0)
     other = koz_jax.maneuver(**GOOD)

@@ -11,6 +11,9 @@ import numpy.typing as npt
 from koz_jax.config.actuators import wheels
 from koz_jax.config.task import SpacecraftConfig
 
+# A wheel that could turn the body so many times as fast as its torque makes use of is of other units.
+_SENSELESS = 10.0
+
 
 class Agility(NamedTuple):
     """How fast a body can turn about an axis."""
@@ -67,6 +70,20 @@ def rate_at_start(spacecraft: SpacecraftConfig) -> float:
     if spacecraft.wheels:
         allowed = min(allowed, _of_wheels(spacecraft))
     return max(allowed, 0.0)
+
+
+def senseless_momenta(spacecraft: SpacecraftConfig) -> list[str]:
+    """Wheels that hold far more than the body can make use of, each in a line: are the units others?"""
+    inertia = float(np.trace(np.array(spacecraft.inertia))) / 3.0
+    quickest = math.sqrt(math.pi) / spacecraft.time_unit  # [rad/s] in the middle of the fastest half turn
+    return [
+        f"wheels.{i}.max_momentum: {wheel.max_momentum:g} N m s would turn the body at"
+        f" {math.degrees(wheel.max_momentum / inertia):.3g} deg/s,"
+        f" {wheel.max_momentum / inertia / quickest:.3g} times what its fastest half turn comes to"
+        f" ({math.degrees(quickest):.3g} deg/s); is it in N m s?"
+        for i, wheel in enumerate(spacecraft.wheels)
+        if wheel.max_momentum / inertia > _SENSELESS * quickest
+    ]
 
 
 def _left_of_gyros(spacecraft: SpacecraftConfig) -> float:

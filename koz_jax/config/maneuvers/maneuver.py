@@ -6,6 +6,7 @@ Angles in degrees, quaternions scalar first; imports no jax.  ``maneuver_file`` 
 from __future__ import annotations
 
 import dataclasses
+import logging
 from typing import Self
 
 import numpy as np
@@ -13,7 +14,7 @@ from pydantic import model_validator
 
 from koz_jax.config import attitudes
 from koz_jax.config.actuators import agility
-from koz_jax.config.base import PositiveFloat, check_steps
+from koz_jax.config.base import PositiveFloat, check_steps, doubt_of_degrees
 from koz_jax.config.maneuvers.maneuver_tables import (
     BodyConfig,
     ConstraintConfig,
@@ -26,6 +27,8 @@ from koz_jax.config.maneuvers.maneuver_tables import (
 )
 from koz_jax.config.task import RewardConfig, TaskConfig
 
+_log = logging.getLogger(__name__)
+
 # A maneuver lasts so many half turns by full torque unless it says otherwise, and at least so many at the largest rate;
 # in whole tens of seconds.  An hour for one at the largest rate is the most that is waited for.
 _HALF_TURNS, _HALF_TURNS_AT_RATE, _WHOLE_SECONDS, _LONGEST_SECONDS = 5, 2, 10.0, 3600.0
@@ -36,9 +39,6 @@ _ROLL_STEP_DEG, _ROLL_CLEARANCE_DEG = 0.1, 0.25
 
 # A turn whose half angle has a sine below it is none.
 _NO_TURN = 1e-9
-
-# Half angles below it are rather radians: pi / 2 and less.
-_RADIANS_BELOW = 1.6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,6 +107,13 @@ class ManeuverConfig(Table):
         self._check_clear("start.attitude", self.start.attitude, 0.0)
         where = "target.attitude" if self.target.attitude else "target.direction"
         self._check_clear(where, self.aim.attitude, self.seconds)
+        return self
+
+    @model_validator(mode="after")
+    def _told(self) -> Self:
+        """Log the cautions of a maneuver that can be flown, wherever it comes from."""
+        for caution in self.cautions:
+            _log.warning("%s: %s", self.name, caution)
         return self
 
     def _check_clear(self, where: str, attitude: tuple[float, ...], seconds: float) -> None:
@@ -205,7 +212,10 @@ class ManeuverConfig(Table):
     @property
     def cautions(self) -> list[str]:
         """What is allowed and looks wrong, each in a line."""
-        return [*self._small_cones, *self._short_of_time]
+        cones = [doubt_of_degrees(one.half_angle_deg) for one in self.constraints]
+        small = [f"constraints.{i}.half_angle_deg: {doubt}" for i, doubt in enumerate(cones) if doubt]
+        momenta = agility.senseless_momenta(self.task.spacecraft)
+        return [*small, *(f"spacecraft.{momentum}" for momentum in momenta), *self._short_of_time]
 
     @property
     def _short_of_time(self) -> list[str]:
@@ -223,15 +233,6 @@ class ManeuverConfig(Table):
         return [
             f"duration_seconds: is {self.seconds:g}, and the turn by {angle_deg:.3g} deg takes {least:.3g} s or more"
             f" ({turning}{limited})"
-        ]
-
-    @property
-    def _small_cones(self) -> list[str]:
-        return [
-            f"constraints.{i}.half_angle_deg: {one.half_angle_deg:g} deg is small; is it {one.half_angle_deg:g} rad ="
-            f" {np.rad2deg(one.half_angle_deg):.1f} deg?"
-            for i, one in enumerate(self.constraints)
-            if one.half_angle_deg < _RADIANS_BELOW
         ]
 
 

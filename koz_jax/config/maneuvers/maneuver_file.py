@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import tomllib
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,8 +13,6 @@ from koz_jax.config.maneuvers.maneuver import ManeuverConfig
 from koz_jax.config.maneuvers.maneuver_tables import BodyConfig, ConstraintConfig, InstrumentConfig, Table
 from koz_jax.config.task import TaskConfig
 from koz_jax.errors import SettingsError, explain
-
-_log = logging.getLogger(__name__)
 
 TableType = TypeVar("TableType", bound=Table)
 
@@ -63,10 +60,7 @@ def load_maneuver(path: Path | str) -> ManeuverConfig:
 
     """
     given = _read("maneuver", Path(path))
-    maneuver = _validated(ManeuverConfig, {"name": Path(path).stem} | given, Path(path))
-    for caution in maneuver.cautions:
-        _log.warning("%s: %s", path, caution)
-    return maneuver
+    return _validated(ManeuverConfig, {"name": Path(path).stem} | given, Path(path))
 
 
 def load_spacecraft(path: Path | str) -> SpacecraftFile:
