@@ -10,6 +10,9 @@ from koz_jax.config.task import TaskConfig
 from koz_jax.evaluation.digits import significant
 from koz_jax.evaluation.rollout import CaseResult, History
 
+# [rad] In float32.
+_ROUNDING = 1e-6
+
 
 def _csv(columns: dict[str, np.ndarray]) -> str:
     text = io.StringIO()
@@ -67,14 +70,21 @@ def describe_case(case: int, result: CaseResult) -> str:
     return f"case {case}: {describe_result(result)}"
 
 
+def _clearance(result: CaseResult) -> str:
+    """How far it stayed from the zones; one that is absent has a margin of pi or more, which no other has."""
+    margin = float(result.min_margin)
+    if margin >= np.pi - _ROUNDING:
+        return "no zone"
+    zone = "violated the zone" if result.violated else "stayed clear of the zone"
+    return f"{zone} (smallest margin {significant(np.rad2deg(margin), 2)} deg)"
+
+
 def describe_result(result: CaseResult) -> str:
     """What a maneuver comes to, in one line."""
     settled = f"settled after {significant(float(result.settling_time), 1)} s" if result.settled else "not settled"
-    zone = "violated the zone" if result.violated else "stayed clear of the zone"
     start = ", from a start that the shield does not cover" if result.unsafe_start else ""
     return (
-        f"{significant(np.rad2deg(float(result.initial_angle)), 1)} deg{start}, {settled}, {zone}"
-        f" (smallest margin {significant(np.rad2deg(float(result.min_margin)), 2)} deg),"
+        f"{significant(np.rad2deg(float(result.initial_angle)), 1)} deg{start}, {settled}, {_clearance(result)},"
         f" effort {significant(float(result.control_effort), 1)} N2 m2 s,"
         f" accuracy {significant(np.rad2deg(float(result.control_accuracy)), 4)} deg,"
         f" reward {significant(float(result.reward), 1)}"

@@ -232,6 +232,17 @@ REFUSED = {
     ),
     "unknown table": ("[start]", "[stop]\nx = 1\n[start]", "unknown key 'stop'"),
     "missing step": ("step_seconds = 0.2", "", "step_seconds: Field required"),
+    "moments alone": (
+        "inertia = [[0.05, 0, 0], [0, 0.06, 0], [0, 0, 0.02]]",
+        "inertia = [0.05, 0.06, 0.02]",
+        "spacecraft.inertia: must be three rows of three numbers, such as [[0.05, 0.0, 0.0], [0.0, 0.06, 0.0],"
+        " [0.0, 0.0, 0.02]] (got (0.05, 0.06, 0.02))",
+    ),
+    "two rows": (
+        "inertia = [[0.05, 0, 0], [0, 0.06, 0], [0, 0, 0.02]]",
+        "inertia = [[0.05, 0, 0], [0, 0.06, 0]]",
+        "spacecraft.inertia: must be three rows of three numbers, such as",
+    ),
     "missing inertia": ("inertia = ", "# ", "spacecraft.inertia: Field required"),
     "a number as text": ("torque_limit = 0.004", 'torque_limit = "0.004"', "spacecraft.torque_limit"),
     "a truth value": (
@@ -343,7 +354,8 @@ REFUSED = {
     "target by direction inside": (
         TARGET,
         'instrument = "telescope"\ndirection = [0, 1, 0]',
-        "target.direction: no roll about it keeps every constraint by 0.25 deg; the best leaves -20 deg",
+        "target.direction: no roll about it keeps every constraint by 0.25 deg; the best leaves -20 deg to constraints.0,"
+        " a keep_out cone of half angle 20 deg for 'telescope', got (0.0, 1.0, 0.0)",
     ),
     "g cm2": (
         "[[0.05, 0, 0], [0, 0.06, 0], [0, 0, 0.02]]",

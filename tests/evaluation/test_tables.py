@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support import tiny
 
+import koz_jax
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.evaluation import cases, tables
 from koz_jax.evaluation.rollout import CaseResult
@@ -70,3 +71,11 @@ def test_a_history_is_a_row_per_instant():
     quaternion = np.array([[float(row[f"q_e{i}"]) for i in range(4)] for row in rows])
     np.testing.assert_allclose(np.linalg.norm(quaternion, axis=1), 1.0, atol=1e-6)
     assert "case 0:" in tables.describe_case(0, result) and "not settled" in tables.describe_case(0, result)
+
+
+def test_where_there_is_no_zone_none_is_spoken_of():
+    flown, absent = (koz_jax.maneuver((0.5, 0.5, 0.5, 0.5), zones=zones) for zones in ([((0, 0, -1), 20.0)], []))
+    for drawn, words in ((flown, "the zone (smallest margin "), (absent, "settled, no zone, effort ")):
+        _, result = cases.fly_scenario(AGENT, drawn)
+        told = tables.describe_result(result)
+        assert words in told and ("margin" in told) == (drawn is flown)

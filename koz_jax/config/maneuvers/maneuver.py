@@ -126,9 +126,16 @@ class ManeuverConfig(Table):
             when = f" after {seconds:g} s" if any(constraint.rotation_deg) and seconds else ""
             raise ValueError(
                 f"{where}: must keep every constraint; ({written}) has {constraint.instrument!r}"
-                f" {-margins.min():.3g} deg {constraint.forbidden_side} constraints.{number}{when}, a"
-                f" {constraint.kind} cone of half angle {constraint.half_angle_deg:g} deg"
+                f" {-margins.min():.3g} deg {constraint.forbidden_side} {self._named(number, when)}"
             )
+
+    def _named(self, number: int, when: str = "") -> str:
+        """A constraint, for messages."""
+        constraint = self.constraints[number]
+        return (
+            f"constraints.{number}{when}, a {constraint.kind} cone of half angle {constraint.half_angle_deg:g} deg for"
+            f" {constraint.instrument!r}"
+        )
 
     def boresight(self, instrument: str) -> np.ndarray:
         """Where an instrument looks.  Returns (3,) unit vector in body axes."""
@@ -168,12 +175,14 @@ class ManeuverConfig(Table):
         rolls_deg = _ROLL_STEP_DEG * np.arange(1, count + 1)
         rolls_deg = np.stack([rolls_deg, -rolls_deg], axis=1).ravel()
         rolled = attitudes.multiply(attitudes.turn_about(direction, np.deg2rad(rolls_deg)), straight)
-        clear = self.margins_deg(rolled, self.seconds).min(axis=1)
+        margins = self.margins_deg(rolled, self.seconds)
+        clear = margins.min(axis=1)
         found = int(np.argmax(clear >= _ROLL_CLEARANCE_DEG)) if clear.max() >= _ROLL_CLEARANCE_DEG else None
         if found is None:
+            nearest = self._named(int(margins[clear.argmax()].argmin()))
             raise ValueError(
                 f"target.direction: no roll about it keeps every constraint by {_ROLL_CLEARANCE_DEG:g} deg;"
-                f" the best leaves {clear.max():.3g} deg, got {self.target.direction}"
+                f" the best leaves {clear.max():.3g} deg to {nearest}, got {self.target.direction}"
             )
         return _nearer(rolled[found], start, float(rolls_deg[found]))
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
-from pydantic import AfterValidator, ValidationError, model_validator
+from pydantic import AfterValidator, ValidationError, field_validator, model_validator
 
 from koz_jax.config import attitudes
 from koz_jax.config.actuators import agility
@@ -80,6 +80,16 @@ class BodyConfig(Table):
     """Control moment gyros."""
     max_rate_deg: PositiveFloat | None = None
     """Largest norm of the body rate [deg/s]; kept by agents for any spacecraft."""
+
+    @field_validator("inertia", mode="before")
+    @classmethod
+    def _three_rows(cls, given: Any) -> Any:
+        rows = given if isinstance(given, list | tuple) else ()
+        if len(rows) == 3 and all(isinstance(row, list | tuple) and len(row) == 3 for row in rows):
+            return given
+        moments = len(rows) == 3 and all(isinstance(row, int | float) for row in rows)
+        example = np.diag(rows if moments else (0.05, 0.06, 0.02)).tolist()
+        raise ValueError(f"must be three rows of three numbers, such as {example}")
 
     @model_validator(mode="after")
     def _physical(self) -> Self:
