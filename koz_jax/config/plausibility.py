@@ -55,7 +55,7 @@ def findings(task: TaskConfig, min_angle_deg: float, max_angle_deg: float) -> li
 
 
 def _too_slow(task: TaskConfig, slowest: Agility, angle_deg: float) -> list[Finding]:
-    """A turn that takes too long at the largest rate; not all controllers keep one, so that something can be learned."""
+    """A turn that takes too long at the largest rate; not all controllers keep one, so something can be learned."""
     rate = rate_at_start(task.spacecraft)
     least = slowest.turn_seconds(angle_deg, rate)
     if least <= task.episode_seconds:
@@ -63,8 +63,8 @@ def _too_slow(task: TaskConfig, slowest: Agility, angle_deg: float) -> list[Find
     what = "max_rate_deg" if task.spacecraft.max_rate_deg is not None else "what its actuators can stop"
     return [
         Finding(
-            f"task.spacecraft: a turn by {angle_deg:g} deg takes {least:.3g} s or more at {math.degrees(rate):.3g} deg/s,"
-            f" the largest rate ({what}), and episode_seconds is {task.episode_seconds:g}",
+            f"task.spacecraft: a turn by {angle_deg:g} deg takes {least:.3g} s or more at {math.degrees(rate):.3g}"
+            f" deg/s, the largest rate ({what}), and episode_seconds is {task.episode_seconds:g}",
             False,
         )
     ]

@@ -92,7 +92,9 @@ class Metadata(Settings):
 
     def to_json(self, indent: int | None = None) -> str:
         """What exported files hold."""
-        unused = {name for name in ("scaling", "wheels", "further_instruments", "least_zones") if not getattr(self, name)}
+        unused = {
+            name for name in ("scaling", "wheels", "further_instruments", "least_zones") if not getattr(self, name)
+        }
         return self.model_dump_json(indent=indent, exclude=unused)
 
 

@@ -179,7 +179,9 @@ def test_flags_in_radians_are_told_once(tmp_path, capsys, monkeypatch):
     with pytest.raises(pytest.fail.Exception):
         tiny.status("fly", *argv)
     told = capsys.readouterr().err
-    assert told.count("is it 0.5236 rad = 30.0 deg?") == 1 and "constraints.0.half_angle_deg: 0.5236 deg is small" in told
+    assert (
+        told.count("is it 0.5236 rad = 30.0 deg?") == 1 and "constraints.0.half_angle_deg: 0.5236 deg is small" in told
+    )
 
 
 TURN = ("--from", 1, 0, 0, 0, "--to", 0, 1, 0, 0)

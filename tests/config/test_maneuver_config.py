@@ -354,8 +354,8 @@ REFUSED = {
     "target by direction inside": (
         TARGET,
         'instrument = "telescope"\ndirection = [0, 1, 0]',
-        "target.direction: no roll about it keeps every constraint by 0.25 deg; the best leaves -20 deg to constraints.0,"
-        " a keep_out cone of half angle 20 deg for 'telescope', got (0.0, 1.0, 0.0)",
+        "target.direction: no roll about it keeps every constraint by 0.25 deg; the best leaves -20 deg to"
+        " constraints.0, a keep_out cone of half angle 20 deg for 'telescope', got (0.0, 1.0, 0.0)",
     ),
     "g cm2": (
         "[[0.05, 0, 0], [0, 0.06, 0], [0, 0, 0.02]]",
@@ -429,7 +429,7 @@ def test_wheels_that_hold_what_the_body_makes_no_use_of_are_cautioned_of(momentu
     wheels = [{"axis": axis, "max_torque": 0.004, "max_momentum": momentum} for axis in np.eye(3).tolist()]
     found = made(spacecraft={"torque_limit": None, "wheels": wheels})
     words = [f"spacecraft.wheels.{i}.max_momentum: {momentum:g} N m s would turn the body at" for i in range(3)]
-    assert [caution.startswith(word) for caution, word in zip(found.cautions, words * told, strict=True)] == [True] * 3 * told
+    assert all(caution.startswith(word) for caution, word in zip(found.cautions, words * told, strict=True))
     task = TaskConfig(spacecraft=found.task.spacecraft, step_seconds=0.2)
     assert sum("max_momentum" in finding.text for finding in plausibility.findings(task, 80.0, 180.0)) == 3 * told
 

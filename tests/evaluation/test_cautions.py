@@ -74,7 +74,7 @@ OWN_UNIT = OWN.spacecraft.time_unit
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"step_seconds": 0.25 * OWN_UNIT}, ["a time step of 0.25 T in place of 0.016 to 0.06 (T = sqrt(J / u) = 5.48 s)"]),
+        ({"step_seconds": 0.25 * OWN_UNIT}, ["0.25 T in place of 0.016 to 0.06 (T = sqrt(J / u) = 5.48 s)"]),
         ({"step_seconds": 0.01 * OWN_UNIT}, ["a time step of 0.01 T in place of 0.016 to 0.06"]),
         ({"spacecraft": {"max_rate_deg": 0.5}}, ["a largest rate of 0.048 / T in place of 0.19 or more"]),
         ({"step_seconds": 0.03 * OWN_UNIT, "spacecraft": {"max_rate_deg": 3.0}}, []),

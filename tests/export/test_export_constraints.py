@@ -46,9 +46,7 @@ def test_c_is_told_of_all_constraints_and_each_may_have_any_place(tmp_path, monk
     library = CLibrary(tmp_path)
     assert library.zones == 3
     drawn = situations(files.made_for(agent, body.task), 300, least_zones=3)
-    last_first = drawn.replace(
-        zone_axis_N=drawn.zone_axis_N[:, ::-1], zone_half_angle=drawn.zone_half_angle[:, ::-1]
-    )
+    last_first = drawn.replace(zone_axis_N=drawn.zone_axis_N[:, ::-1], zone_half_angle=drawn.zone_half_angle[:, ::-1])
     told, turned = rows(drawn), rows(last_first)
     requested = np.zeros((300, 3))
     observed, same = (library.observe(table, library.start(table))[0] for table in (told, turned))

@@ -19,9 +19,7 @@ def _entries(agent: Agent, further: int, least_zones: int) -> int:
     return 11 + (5 if further else 4) * zones + len(agent.task.spacecraft.wheels)
 
 
-def golden(
-    agent: Agent, count: int, further_boresights: Sequence[Vector] = (), least_zones: int = 0
-) -> Golden:
+def golden(agent: Agent, count: int, further_boresights: Sequence[Vector] = (), least_zones: int = 0) -> Golden:
     """In place of ``export.golden.golden``."""
     network, wheels = agent.controller.network, len(agent.task.spacecraft.wheels)
     memory = 4 + network.scaled + 3 * bool(wheels) + bool(further_boresights)

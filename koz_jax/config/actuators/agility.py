@@ -1,4 +1,4 @@
-"""How fast a spacecraft can turn: its accelerations, its largest rate, and the least time of a turn.  Imports no jax."""
+"""How fast a spacecraft can turn: its accelerations, largest rate, and the least time of a turn.  Imports no jax."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def rate_at_start(spacecraft: SpacecraftConfig) -> float:
 
 
 def senseless_momenta(spacecraft: SpacecraftConfig) -> list[str]:
-    """Wheels that hold far more than the body can make use of, each in a line: are the units others?"""
+    """Wheels that hold far more than the body can make use of, each in a line.  Their units may be others."""
     inertia = float(np.trace(np.array(spacecraft.inertia))) / 3.0
     quickest = math.sqrt(math.pi) / spacecraft.time_unit  # [rad/s] in the middle of the fastest half turn
     return [

@@ -57,8 +57,8 @@ class ManeuverConfig(Table):
     step_seconds: PositiveFloat
     """Time step; the torque is held over it [s]."""
     duration_seconds: PositiveFloat | None = None
-    """How long it is flown [s]; by default five times the fastest half turn about the slowest axis, or two half turns at
-    the largest rate where that is longer, in whole tens."""
+    """How long it is flown [s]; by default five times the fastest half turn about the slowest axis, or two half turns
+    at the largest rate where that is longer, in whole tens."""
     settled_angle_deg: PositiveFloat = RewardConfig().settled_angle_deg
     """Settled is what stays within this angle of the target [deg]."""
     source: str = ""

@@ -119,8 +119,8 @@ class BodyConfig(Table):
         """
         if spacecraft.gyros:
             raise ValueError(
-                f"spacecraft.gyros: must be none, got {len(spacecraft.gyros)}; a file with a table [spacecraft.gyros] can"
-                " describe a pyramid of them"
+                f"spacecraft.gyros: must be none, got {len(spacecraft.gyros)}; a file with a table [spacecraft.gyros]"
+                " can describe a pyramid of them"
             )
         wheels = tuple(WheelTable(**wheel.model_dump()) for wheel in spacecraft.wheels)
         return cls(
