@@ -27,8 +27,8 @@ class PointingConstraint(struct.PyTreeNode):
 
     @property
     def is_present(self) -> jax.Array:
-        """Whether there is a cone at all.  Returns () bool."""
-        return self.half_angle > 0.0
+        """Whether there is a cone at all, also one of which the half angle is no number.  Returns () bool."""
+        return ~(self.half_angle <= 0.0)
 
     @property
     def count(self) -> int:

@@ -82,7 +82,10 @@ BAD = [
     ("--filter zoh_cbf --robust", ["robust: is of the shield, and needs --shield"]),
     ("--shield --robust", ["robust: needs an error to withstand"]),
     ("--shield --shield-margin-deg 0", ["shield_margin_deg: Input should be greater than 0"]),
-    ("--shield --robust --disturbance-torque 3", ["disturbance_torque: must be below the torque limit of 2.0", "3.0"]),
+    (
+        "--shield --robust --disturbance-torque 3",
+        ["disturbance_torque: must be below 0.5 times the torque limit of 2.0", "3.0"],
+    ),
     ("--inertia-error 1.5", ["inertia_error", "less than 1", "1.5"]),
     ("--controller nobody", ["controller: must be one of pd, potential", "FILE.py:CLASS", "nobody"]),
     ("--task.step-seconds -1", ["task.step_seconds: Input should be greater than 0 (got -1.0)"]),

@@ -112,6 +112,6 @@ def test_a_shield_for_slower_cones_is_refused_by_name():
 
 def test_the_faster_cones_may_turn_the_farther_the_shield_keeps_away():
     margins = [
-        float(shield.from_config(ShieldConfig(cone_rate_deg=rate), ENV.model).margin) for rate in (0.0, 0.1, 1.0)
+        float(shield.from_config(ShieldConfig(cone_rate_deg=rate), ENV.model).guide.margin) for rate in (0.0, 0.1, 1.0)
     ]
     assert margins[0] < margins[1] < margins[2]

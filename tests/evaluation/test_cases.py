@@ -216,11 +216,11 @@ def test_the_environment_is_under_the_conditions_that_the_settings_ask_for():
 def test_a_shield_against_more_than_there_is_torque_for_is_refused():
     strong = ShieldConfig(error_bounds=UncertaintyConfig(disturbance_torque=2.0))
     with pytest.raises(
-        SettingsError, match=r"disturbance_torque: must be below the torque limit of 2.0 N m .*, got 2.0"
+        SettingsError, match=r"disturbance_torque: must be below 0.5 times the torque limit of 2.0 N m .*, got 2.0"
     ):
         cases.environment(AGENT.task, MonteCarloConfig(shield=strong))
     weak_axis = TaskConfig.model_validate({"spacecraft": {"torque_limit": (3.0, 0.5, 3.0)}})
-    with pytest.raises(SettingsError, match=r"below the torque limit of 0.5 N m"):
+    with pytest.raises(SettingsError, match=r"below 0.5 times the torque limit of 0.5 N m"):
         cases.environment(weak_axis, MonteCarloConfig(shield=strong))
 
 

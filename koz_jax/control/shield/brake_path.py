@@ -14,21 +14,27 @@ from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.pointing_constraints import PointingConstraint
 from koz_jax.task.state import Model
 
-# Steps in which a slow craft comes to rest, whatever it is asked for, with the one that is decided on.
-SOON_STEPS = 6.0
-
 
 class Brake(struct.PyTreeNode):
     """A brake, and bounds on what it does not know; traced but for the number of samples."""
 
-    torque: jax.Array  # () [N m] norm of the torque that brakes, k
+    torque: jax.Array  # () [N m] norm of the torque that brakes whatever disturbs, k
     inertia_error: jax.Array  # () largest relative error of the inertia
     disturbance: jax.Array  # () [N m] largest torque from outside
     rate_error: jax.Array  # () [rad/s] largest error of a measured rate
     cone_rate: jax.Array  # () [rad/s] largest rate of a cone's axis
+    approach: jax.Array  # () [rad/s] with which all of these may bring a zone closer while the craft is held at rest
+    soon: jax.Array  # () [s] in which it is led away, during which this is counted alike whatever is decided
     smallest_moment: jax.Array  # () [kg m^2] of inertia, a
     largest_moment: jax.Array  # () [kg m^2] c
     samples: int = struct.field(pytree_node=False)  # of a brake path
+
+    def without_errors(self, meant: jax.Array) -> "Brake":
+        """The brake as it is meant, of no other inertia and undisturbed, where that is asked for.  meant: () bool."""
+        return self.replace(
+            inertia_error=jnp.where(meant, 0.0, self.inertia_error),
+            disturbance=jnp.where(meant, 0.0, self.disturbance),
+        )
 
 
 class Situation(struct.PyTreeNode):
@@ -54,8 +60,8 @@ class _Tolerance(struct.PyTreeNode):
     gyroscopic: jax.Array  # () [rad] at its end, of a wrong inertia's gyroscopic torque
     drift: jax.Array  # () [rad/s] per second of free motion
     integration: jax.Array  # () [rad]
-    soon: jax.Array  # () [rad] that cones turn in some steps, which is the same whoever decides
-    swept: jax.Array  # () [rad] that they turn in the rest of the brake's time
+    soon: jax.Array  # () [rad] that zones come closer in some time, which is the same whatever is decided
+    swept: jax.Array  # () [rad] that they come closer in the rest of the brake's time
 
     def after(self, share: jax.Array, seconds: jax.Array) -> jax.Array:
         """Tolerance [rad] after a share () of the path, that is after so many seconds () of free motion."""
@@ -96,12 +102,15 @@ def situation(constraints: PointingConstraint, model: Model) -> Situation:
 
 
 def torque(brake: Brake, body: RigidBodyState, model: Model) -> jax.Array:
-    """Torque against the angular momentum as it stands in the middle of the step.  Returns (3,) [N m]."""
+    """Torque against the angular momentum as it stands in the middle of the step.  Returns (3,) [N m].
+
+    All that there is: what a disturbance may take of it is only not counted on.
+    """
     momentum_B = dynamics.matvec(model.inertia_B, body.omega_BN_B)
     # What is fixed in inertial axes turns in body axes by v' = v x w.
     middle_B = momentum_B + 0.5 * model.dt * rotations.cross(momentum_B, body.omega_BN_B)
     size = rotations.norm(middle_B)
-    strength = jnp.minimum(brake.torque, rotations.norm(momentum_B) / model.dt)
+    strength = jnp.minimum(brake.torque + brake.disturbance, rotations.norm(momentum_B) / model.dt)
     return -strength * middle_B / jnp.where(size > 0.0, size, 1.0)
 
 
@@ -119,7 +128,7 @@ def clearance(
     Args:
         brake: the brake.
         body: where the path begins.
-        push_error: () [rad/s] error of its rate beyond that of measurement, see ``push_error``.
+        push_error: () [rad/s] error of its rate beyond what ``approach`` counts, see ``push_error``.
         at: the zones.
         model: the spacecraft.
         enough: () [rad] a bound that is at least this need not be the best.
@@ -220,25 +229,35 @@ def _free_seconds(brake: Brake, momentum: jax.Array, dt: jax.Array) -> jax.Array
     return jnp.where(momentum > 0.0, integral / jnp.where(momentum > 0.0, momentum, 1.0), 0.5 * dt)
 
 
-def push_error(brake: Brake, torque_B: jax.Array, dt: jax.Array) -> jax.Array:
-    """Error of the rate after a step from a measured state with a torque (3,) [N m].  Returns () [rad/s]."""
-    e = brake.inertia_error
-    return (e / (1.0 - e) * rotations.norm(torque_B) + brake.disturbance) * dt / brake.smallest_moment
+def push_error(brake: Brake, body: RigidBodyState, torque_B: jax.Array, model: Model) -> jax.Array:
+    """Error of the rate after a step with a torque (3,) [N m], from a wrong inertia.  Returns () [rad/s]."""
+    e, a = brake.inertia_error, brake.smallest_moment
+    size = rotations.norm(torque_B)
+    twice_energy = rotations.dot(body.omega_BN_B, dynamics.matvec(model.inertia_B, body.omega_BN_B))
+    rate = jnp.sqrt(jnp.maximum(twice_energy, 0.0) / a) + (size + brake.disturbance) * model.dt / a
+    return (e / (1.0 - e) * size / a + _gyroscopic_error(brake) * rate**2) * model.dt
+
+
+def _gyroscopic_error(brake: Brake) -> jax.Array:
+    """Error of the angular acceleration without a torque, per squared rate.  Returns ()."""
+    e, a, c = brake.inertia_error, brake.smallest_moment, brake.largest_moment
+    return e * jnp.sqrt(c / a) + e / (1.0 - e) * ((c - a) + e * (c + a)) / (2.0 * a)
 
 
 def _tolerance(brake: Brake, motion: _Motion, length: jax.Array, pushed: jax.Array, dt: jax.Array) -> _Tolerance:
-    e, a, c = brake.inertia_error, brake.smallest_moment, brake.largest_moment
+    trust = brake.inertia_error / (1.0 - brake.inertia_error)
     arc = motion.rate * length
     # Torques act through a wrong inertia, and are held over a step instead of turned with the body.
-    astray = e / (1.0 - e) + (motion.rate * dt) ** 2
-    gyroscopic = e * jnp.sqrt(c / a) + e / (1.0 - e) * ((c - a) + e * (c + a)) / (2.0 * a)
+    astray = trust + (motion.rate * dt) ** 2
+    # What a wrong inertia leaves over at the end takes further steps to take out.
+    over = trust * motion.rate * dt
     return _Tolerance(
-        at_rest=arc * astray * (1.0 + astray) + 2.0 * brake.disturbance * length**2 / a,
-        gyroscopic=gyroscopic * arc**2,
-        drift=2.0 * (brake.rate_error + pushed),
+        at_rest=arc * astray * (1.0 + astray) + over + 2.0 * brake.disturbance * length**2 / brake.smallest_moment,
+        gyroscopic=_gyroscopic_error(brake) * arc**2,
+        drift=2.0 * pushed,
         integration=brake.samples * (motion.rate * length / brake.samples) ** 5 / 120.0,
-        soon=brake.cone_rate * SOON_STEPS * dt,
-        swept=brake.cone_rate * jnp.maximum(motion.momentum / brake.torque - (SOON_STEPS - 2.0) * dt, 0.0),
+        soon=brake.approach * brake.soon,
+        swept=brake.approach * jnp.maximum(motion.momentum / brake.torque - (brake.soon - 2.0 * dt), 0.0),
     )
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from koz_jax.config.shield import ShieldConfig
-from koz_jax.control.shield.brake_path import SOON_STEPS, Brake
+from koz_jax.control.shield.brake_path import Brake
 from koz_jax.task import dynamics, pointing_constraints, rotations
 from koz_jax.task.actuators import TorqueLimits
 from koz_jax.task.dynamics import RigidBodyState
@@ -27,43 +27,65 @@ _RATE_SHARE = 0.5
 AHEAD = 2.0
 
 
+# And steps in which a slow craft comes to rest, whatever it is asked for, with the one that is decided on.
+_STEPS = 6.0
+
+
 class Guide(struct.PyTreeNode):
     """A guide made for one spacecraft; traced."""
 
+    margin: jax.Array  # () [rad] that it keeps from every zone
     rate: jax.Array  # () [rad/s] with which a boresight is led around a zone
     seconds: jax.Array  # () [s] in which the rate is taken up
     tilt: jax.Array  # () tangent of the angle by which the way around leads away from the zone
 
 
-def from_config(config: ShieldConfig, brake: Brake, limits: TorqueLimits, model: Model) -> Guide:
-    """Make a guide: as fast as the settings say, or as suits the spacecraft."""
-    unit = jnp.sqrt(jnp.trace(model.inertia_B) / (3.0 * limits.scale))
-    wanted = _RATE_T / unit if config.guide_rate_deg is None else jnp.deg2rad(jnp.float32(config.guide_rate_deg))
+def from_config(
+    config: ShieldConfig, brake: Brake, margin: jax.Array, seconds: jax.Array, limits: TorqueLimits, model: Model
+) -> Guide:
+    """Make a guide: as fast as the settings say, or as suits the spacecraft.
+
+    margin: () [rad] of the shield; the guide's is larger by what comes closer before it leads away, see ``soon``.
+    seconds: () [s], see ``take_up_seconds``.
+    """
+    wanted = _RATE_T / _unit(limits, model)
+    if config.guide_rate_deg is not None:
+        wanted = jnp.deg2rad(jnp.float32(config.guide_rate_deg))
     rate = jnp.minimum(wanted, _ARC / model.dt)
     largest = nominal_rate(model)
     if largest is not None:
         rate = jnp.minimum(rate, _RATE_SHARE * largest)
     e = brake.inertia_error
     return Guide(
+        margin=margin + brake.approach * brake.soon,
         rate=rate,
-        seconds=jnp.maximum(_SECONDS_T * unit, model.dt),
+        seconds=seconds,
         # A brake path that may be wrong by this share of its length then still leads away.
         tilt=e / (1.0 - e) + brake.disturbance / brake.torque + (rate * model.dt) ** 2,
     )
 
 
-def lead(guide: Guide, brake: Brake, dt: jax.Array) -> jax.Array:
-    """Margin that it takes to lead away from a cone as fast as that comes.  Returns () [rad].
+def take_up_seconds(limits: TorqueLimits, model: Model) -> jax.Array:
+    """Time in which a guide takes up its rate.  Returns () [s]."""
+    return jnp.maximum(_SECONDS_T * _unit(limits, model), model.dt)
 
-    The rate that leads away grows with what is missing to twice the margin: at half of it, 1.5 margins in AHEAD times
-    the guide's seconds.  Twice what the cone turns in those seconds is above that, and above what it turns meanwhile.
+
+def soon(seconds: jax.Array, dt: jax.Array) -> jax.Array:
+    """Time in which a guide that takes up its rate in so many seconds leads away from a zone.  Returns () [s].
+
+    The rate that leads away grows with what is missing to twice the margin: where all is missing that comes closer in
+    this time, it is at least AHEAD times as fast as that comes.
     """
-    return (2.0 * AHEAD * guide.seconds + SOON_STEPS * dt) * brake.cone_rate
+    return 2.0 * AHEAD * seconds + _STEPS * dt
+
+
+def _unit(limits: TorqueLimits, model: Model) -> jax.Array:
+    """T.  Returns () [s]."""
+    return jnp.sqrt(jnp.trace(model.inertia_B) / (3.0 * limits.scale))
 
 
 def torques(
     guide: Guide,
-    margin: jax.Array,
     body: RigidBodyState,
     torque_B: jax.Array,
     constraints: PointingConstraint,
@@ -72,8 +94,8 @@ def torques(
 ) -> tuple[jax.Array, jax.Array]:
     """Lead around the nearest zone, to the side that the boresight moves or is pushed to, and away from all near ones.
 
-    margin: () [rad] that is kept; torque_B: (3,) [N m] that is requested.  Returns two torques (3,) [N m] within the
-    box: one that leads around and away, one that only leads away.
+    torque_B: (3,) [N m] that is requested.  Returns two torques (3,) [N m] within the box: one that leads around and
+    away, one that only leads away.
     """
     margins = pointing_constraints.margins(body.q_BN, constraints)
     margins = jnp.where(constraints.is_present, margins, jnp.inf)
@@ -84,7 +106,7 @@ def torques(
     pushed_B = dynamics.angular_acceleration(body.omega_BN_B, torque_B, model.inertia_B, inverse_B)
     soon_B = body.omega_BN_B + AHEAD * guide.seconds * pushed_B
     sideways = jnp.where(rotations.dot(soon_B, side_B) >= 0.0, guide.rate, -guide.rate)
-    missing = jnp.clip((2.0 * margin - margins) / (AHEAD * guide.seconds), 0.0, guide.rate)
+    missing = jnp.clip((2.0 * guide.margin - margins) / (AHEAD * guide.seconds), 0.0, guide.rate)
     away_rate_B = jnp.sum(missing[:, None] * away_B, axis=0)
     around_B = sideways * side_B + guide.tilt * guide.rate * away_B[nearest]
     gyroscopic_B = dynamics.gyroscopic_torque(body.omega_BN_B, model.inertia_B)

@@ -21,6 +21,7 @@ class RateLimit(struct.PyTreeNode):
     """A limit of the rate for one spacecraft; traced."""
 
     form_B: jax.Array  # (3, 3) M
+    error: jax.Array  # () [rad/s] by which the limit is tighter
     squared: jax.Array  # () [(rad/s)^2] what w . M w keeps to
 
     def squared_peak(self, body: RigidBodyState) -> jax.Array:
@@ -55,22 +56,27 @@ class RateLimit(struct.PyTreeNode):
 def from_model(model: Model, rate_error: jax.Array) -> RateLimit | None:
     """The limit of a spacecraft at the start, at rest; None where it has none.
 
-    rate_error: () [rad/s] largest error of a measured rate, by which the limit is tighter.
+    rate_error: () [rad/s] largest error of a measured rate.  The square root of w . M w is wrong by that times the
+    square root of M's largest eigenvalue, and the momentum that actuators are taken to have to take up by that times
+    the largest moment.
     """
     largest = nominal_rate(model)
     if largest is None:
         return None
-    return RateLimit(dynamics.peak_rate_form(model.inertia_B), _squared(largest, rate_error))
+    form_B = dynamics.peak_rate_form(model.inertia_B)
+    stores = model.actuators.stored_momentum(model.actuators.initial_state()) is not None
+    error = rate_error * (jnp.sqrt(jnp.linalg.eigvalsh(form_B)[2]) + (1.0 if stores else 0.0))
+    return RateLimit(form_B, error, _squared(largest, error))
 
 
-def now(limit: RateLimit, rate_error: jax.Array, measured: EnvState, model: Model) -> RateLimit:
+def now(limit: RateLimit, measured: EnvState, model: Model) -> RateLimit:
     """The limit in a state: that of actuators depends on the momentum that is on board."""
     largest = largest_rate(measured, model)
-    return limit if largest is None else limit.replace(squared=_squared(largest, rate_error))
+    return limit if largest is None else limit.replace(squared=_squared(largest, limit.error))
 
 
-def _squared(largest: jax.Array, rate_error: jax.Array) -> jax.Array:
-    return jnp.maximum(largest - rate_error, 0.0) ** 2
+def _squared(largest: jax.Array, error: jax.Array) -> jax.Array:
+    return jnp.maximum(largest - error, 0.0) ** 2
 
 
 def _positive(x: jax.Array) -> jax.Array:

@@ -63,9 +63,11 @@ def _shield_constants(made: shield.Shield, model: Model, metadata: Metadata) -> 
         "DISTURBANCE": brake.disturbance,
         "RATE_ERROR": brake.rate_error,
         "CONE_RATE": brake.cone_rate,
-        "SOON_STEPS": brake_path.SOON_STEPS,
+        "APPROACH": brake.approach,
+        "SOON": brake.soon,
         "SMALLEST_MOMENT": brake.smallest_moment,
         "LARGEST_MOMENT": brake.largest_moment,
+        "GUIDE_MARGIN": made.guide.margin,
         "GUIDE_RATE": made.guide.rate,
         "GUIDE_SECONDS": made.guide.seconds,
         "GUIDE_TILT": made.guide.tilt,
@@ -73,6 +75,7 @@ def _shield_constants(made: shield.Shield, model: Model, metadata: Metadata) -> 
         "SLOW_STEPS": shield.SLOW_STEPS,
         "RAISE": shield.RAISE,
         "SQUARED_RATE": 1.0 if made.rate_limit is None else made.rate_limit.squared,
+        "RATE_RESERVE": 0.0 if made.rate_limit is None else made.rate_limit.error,
         "RATE_ROUNDING": rate_limit.ROUNDING,
     }
     shares = {"REQUEST_SHARES": shield.REQUEST_SHARES, "GUIDE_SHARES": shield.GUIDE_SHARES}

@@ -26,13 +26,13 @@ static const float smallest_moment = @SMALLEST_MOMENT@; /* [kg m^2] of inertia *
 static const float largest_moment = @LARGEST_MOMENT@;
 static const float speed_per_momentum@OF_INSTRUMENTS@ = @SPEED_PER_MOMENTUM@; /* [1/(kg m^2)] largest, of the boresight */
 static const float shield_margin = @MARGIN@; /* [rad] kept from every zone */
-static const float brake_limit = @BRAKE_TORQUE@; /* [N m] norm of the torque that brakes */
+static const float brake_limit = @BRAKE_TORQUE@; /* [N m] norm of the torque that brakes whatever disturbs */
 static const float attitude_error = @ATTITUDE_ERROR@; /* [rad] largest, of what is measured */
 static const float rate_error = @RATE_ERROR@; /* [rad/s] */
-static const float inertia_error = @INERTIA_ERROR@; /* relative */
-static const float disturbance = @DISTURBANCE@; /* [N m] */
 static const float cone_rate = @CONE_RATE@; /* [rad/s] largest, of a zone's axis */
-static const float soon_steps = @SOON_STEPS@; /* in which a slow craft comes to rest */
+static const float approach = @APPROACH@; /* [rad/s] with which a zone may come closer while the craft is held */
+static const float soon = @SOON@; /* [s] in which the guide leads away from it */
+static const float guide_margin = @GUIDE_MARGIN@; /* [rad] that the guide keeps */
 static const float guide_rate = @GUIDE_RATE@; /* [rad/s] around a zone */
 static const float guide_seconds = @GUIDE_SECONDS@; /* [s] in which the guide takes up its rate */
 static const float guide_tilt = @GUIDE_TILT@; /* of the way around, away from the zone */
@@ -43,6 +43,7 @@ static const float request_shares[REQUEST_SHARES] = {@REQUEST_SHARES@};
 static const float guide_shares[GUIDE_SHARES] = {@GUIDE_SHARES@};
 static const float rate_form[3][3] = {@RATE_FORM@}; /* w.M w: squared largest rate of free motion; 0: no limit */
 @NO_WHEELS@static const float squared_rate = @SQUARED_RATE@; /* [(rad/s)^2] its limit */
+@WHEELS@static const float rate_reserve = @RATE_RESERVE@; /* [rad/s] by which that of the wheels is tighter */
 static const float rate_rounding = @RATE_ROUNDING@;
 static const float unbounded = 1e9f; /* [rad] more than any margin */
 
@@ -50,6 +51,15 @@ typedef struct {
     float q_BN[4];
     float omega_BN_B[3];
 } body_state;
+
+/* What a torque does not do as it should. */
+typedef struct {
+    float inertia;     /* relative error */
+    float disturbance; /* [N m] */
+} errors;
+
+static const errors stated = {@INERTIA_ERROR@, @DISTURBANCE@};
+static const errors none = {0.0f, 0.0f};
 
 /* Vectors in body axes that are fixed in inertial ones: the angular momentum first, then the zones' axes. */
 typedef struct {
@@ -194,25 +204,31 @@ typedef struct {
     float gyroscopic;  /* [rad] at its end, of a wrong inertia's gyroscopic torque */
     float drift;       /* [rad/s] per second of free motion */
     float integration; /* [rad] */
-    float soon;        /* [rad] that zones turn in some steps */
-    float swept;       /* [rad] that they turn in the rest of the brake's time */
+    float soon;        /* [rad] that zones come closer in some time */
+    float swept;       /* [rad] that they come closer in the rest of the brake's time */
 } tolerance;
 
-static tolerance tolerance_of(float momentum, float rate, float length, float push_error)
+/* Error of the angular acceleration without a torque, per squared rate. */
+static float gyroscopic_error(const errors *doubt)
 {
-    const float trust = inertia_error / (1.0f - inertia_error);
+    const float e = doubt->inertia, trust = e / (1.0f - e);
+    const float spread = (largest_moment - smallest_moment) + e * (largest_moment + smallest_moment);
+    return e * sqrtf(largest_moment / smallest_moment) + trust * spread / (2.0f * smallest_moment);
+}
+
+static tolerance tolerance_of(const errors *doubt, float momentum, float rate, float length, float push_error)
+{
+    const float trust = doubt->inertia / (1.0f - doubt->inertia);
     const float arc = rate * length, piece = arc / (float)SAMPLES, turned = rate * KOZ_STEP_SECONDS;
     const float astray = trust + turned * turned;
-    const float spread = (largest_moment - smallest_moment) + inertia_error * (largest_moment + smallest_moment);
     tolerance found;
-    found.at_rest = arc * astray * (1.0f + astray) + 2.0f * disturbance * length * length / smallest_moment;
-    found.gyroscopic = inertia_error * sqrtf(largest_moment / smallest_moment);
-    found.gyroscopic += trust * spread / (2.0f * smallest_moment);
-    found.gyroscopic *= arc * arc;
-    found.drift = 2.0f * (rate_error + push_error);
+    found.at_rest = arc * astray * (1.0f + astray) + trust * turned;
+    found.at_rest += 2.0f * doubt->disturbance * length * length / smallest_moment;
+    found.gyroscopic = gyroscopic_error(doubt) * arc * arc;
+    found.drift = 2.0f * push_error;
     found.integration = (float)SAMPLES * piece * piece * piece * piece * piece / 120.0f;
-    found.soon = cone_rate * soon_steps * KOZ_STEP_SECONDS;
-    found.swept = cone_rate * larger(momentum / brake_limit - (soon_steps - 2.0f) * KOZ_STEP_SECONDS, 0.0f);
+    found.soon = approach * soon;
+    found.swept = approach * larger(momentum / brake_limit - (soon - 2.0f * KOZ_STEP_SECONDS), 0.0f);
     return found;
 }
 
@@ -227,7 +243,8 @@ static float tolerated(const tolerance *bound, float share, float seconds)
  * Lower bound of the margin [rad] to all zones on the brake path from here.  A bound of at least shield_margin need not
  * be the best; one below least is returned as it stands.
  */
-static float clearance(const koz_situation *now, const body_state *body, float push_error, float least)
+static float clearance(
+    const errors *doubt, const koz_situation *now, const body_state *body, float push_error, float least)
 {
     float momentum, rate, speed, length, piece, bulge, to_body[4], look_N[3], found, lowest = unbounded;
     tolerance bound;
@@ -237,7 +254,7 @@ static float clearance(const koz_situation *now, const body_state *body, float p
 @ONE@    speed = smaller(speed_per_momentum * momentum, rate);
     length = free_seconds(momentum);
     piece = length / (float)SAMPLES;
-    bound = tolerance_of(momentum, rate, length, push_error);
+    bound = tolerance_of(doubt, momentum, rate, length, push_error);
 @ONE@    koz_rotate(body->q_BN, koz_boresight_B, look_N);
     for (zone = 0; zone < KOZ_ZONES; zone++) {
         if (now->zone_half_angle[zone] <= 0.0f) continue;
@@ -270,7 +287,7 @@ static float clearance(const koz_situation *now, const body_state *body, float p
 static float step_clearance(
     const koz_situation *now, const body_state *before, const body_state *after, const float torque_B[3])
 {
-    const float dt = KOZ_STEP_SECONDS, size = koz_norm(torque_B) + disturbance;
+    const float dt = KOZ_STEP_SECONDS, size = koz_norm(torque_B) + stated.disturbance;
     float momentum, momentum_after, energy, rate, bulge, start_N[3], end_N[3], lowest = unbounded;
     int zone;
     energy = twice_energy(before, &momentum);
@@ -298,7 +315,7 @@ static void brake(const body_state *body, float torque_B[3])
     float momentum_B[3], turned_B[3], size, strength;
     int i;
     multiply(inertia, body->omega_BN_B, momentum_B);
-    strength = smaller(brake_limit, koz_norm(momentum_B) / KOZ_STEP_SECONDS);
+    strength = smaller(brake_limit + stated.disturbance, koz_norm(momentum_B) / KOZ_STEP_SECONDS);
     koz_cross(momentum_B, body->omega_BN_B, turned_B);
     for (i = 0; i < 3; i++) momentum_B[i] += 0.5f * KOZ_STEP_SECONDS * turned_B[i];
     size = koz_norm(momentum_B);
@@ -345,7 +362,7 @@ static float guide(
         koz_rotate(to_body, now->zone_axis_N[zone], axis_B);
         koz_cross(axis_B, koz_boresight_B@OF_ZONE@, out_B);
         size = koz_norm(out_B);
-        missing = (2.0f * shield_margin - margin) / (guide_ahead * guide_seconds);
+        missing = (2.0f * guide_margin - margin) / (guide_ahead * guide_seconds);
         missing = larger(0.0f, smaller(guide_rate, missing));
         for (i = 0; i < 3; i++) {
             out_B[i] = size > 0.0f ? out_B[i] / size : 0.0f;
@@ -382,7 +399,7 @@ static body_state body_of(const koz_situation *now)
 @WHEELS@/* Square of the rate [rad/s] that the wheels can stop, by the momentum that is on board. */
 @WHEELS@static float squared_limit(const koz_situation *now)
 @WHEELS@{
-@WHEELS@    const float rate = larger(koz_wheels_largest_rate(now) - rate_error, 0.0f);
+@WHEELS@    const float rate = larger(koz_wheels_largest_rate(now) - rate_reserve, 0.0f);
 @WHEELS@    return rate * rate;
 @WHEELS@}
 @WHEELS@
@@ -392,8 +409,10 @@ int koz_is_safe(const koz_situation *now)
 {
     const koz_situation unit = koz_unit_situation(now);
     const body_state body = body_of(&unit);
+    if (2.0f * approach > guide_rate) return 0;
 @WHEELS@    if (!(squared_peak(body.omega_BN_B) <= squared_limit(&unit))) return 0;
-    return koz_fault(now) == NULL && clearance(&unit, &body, 0.0f, shield_margin) >= shield_margin;
+@WHEELS@    if (stated.disturbance > 0.0f && !(squared_limit(&unit) > 0.0f)) return 0;
+    return koz_fault(now) == NULL && clearance(&stated, &unit, &body, 0.0f, shield_margin) >= shield_margin;
 }
 
 typedef struct {
@@ -404,11 +423,15 @@ typedef struct {
 } search;
 
 /* Lower bound of the clearance [rad] after a candidate; one below least is returned as it stands. */
-static float clearance_after(const search *at, const float torque_B[3], const body_state *after, float least)
+static float clearance_after(
+    const errors *doubt, const search *at, const float torque_B[3], const body_state *after, float least)
 {
-    const float trust = inertia_error / (1.0f - inertia_error);
-    const float pushed = (trust * koz_norm(torque_B) + disturbance) * KOZ_STEP_SECONDS / smallest_moment;
-    return clearance(at->now, after, pushed, least);
+    const float trust = doubt->inertia / (1.0f - doubt->inertia), size = koz_norm(torque_B);
+    float momentum, rate, pushed;
+    rate = sqrtf(twice_energy(&at->body, &momentum) / smallest_moment);
+    rate += (size + doubt->disturbance) * KOZ_STEP_SECONDS / smallest_moment;
+    pushed = (trust * size / smallest_moment + gyroscopic_error(doubt) * rate * rate) * KOZ_STEP_SECONDS;
+    return clearance(doubt, at->now, after, pushed, least);
 }
 
 /* Square of the largest rate that the body has if it coasts or brakes from here. */
@@ -444,21 +467,27 @@ static float squared_peak(const float omega_B[3])
     for (i = 0; i < 3; i++) torque_B[i] = brake_B[i] + share * (torque_B[i] - brake_B[i]);
 }
 
-/* Whether a candidate a share + b (1 - share) can be let through, which it then is: allowed_B. */
-static int passes(
-    const search *at, float share, const float a_B[3], const float b_B[3], float least, float allowed_B[3])
+/* Whether a torque can be let through. */
+static int is_allowed(const errors *doubt, const search *at, const float torque_B[3], float least)
 {
     const float slack = attitude_error + rate_error * KOZ_STEP_SECONDS;
 @WHEELS@    const float squared_rate = at->squared_rate;
     body_state after;
     float least_peak;
-    int i;
-    for (i = 0; i < 3; i++) allowed_B[i] = share * a_B[i] + (1.0f - share) * b_B[i];
-    push(&at->body, allowed_B, &after);
+    push(&at->body, torque_B, &after);
     least_peak = larger(squared_rate, squared_peak(at->body.omega_BN_B));
     if (!(squared_peak(after.omega_BN_B) <= (1.0f + rate_rounding) * least_peak)) return 0;
-    if (!(clearance_after(at, allowed_B, &after, least) >= least)) return 0;
-    return at->present <= slack || step_clearance(at->now, &at->body, &after, allowed_B) >= slack;
+    if (!(clearance_after(doubt, at, torque_B, &after, least) >= least)) return 0;
+    return at->present <= slack || step_clearance(at->now, &at->body, &after, torque_B) >= slack;
+}
+
+/* Whether a share + b (1 - share) can be let through, which it then is: allowed_B. */
+static int passes(
+    const search *at, float share, const float a_B[3], const float b_B[3], float least, float allowed_B[3])
+{
+    int i;
+    for (i = 0; i < 3; i++) allowed_B[i] = share * a_B[i] + (1.0f - share) * b_B[i];
+    return is_allowed(&stated, at, allowed_B, least);
 }
 
 static void allow(const koz_situation *now, const float requested_B[3], float allowed_B[3])
@@ -480,15 +509,19 @@ static void allow(const koz_situation *now, const float requested_B[3], float al
 
     nearest = guide(now, &at.body, request_B, around_B, away_B);
     push(&at.body, brake_B, &after);
-    braking = clearance_after(&at, brake_B, &after, -unbounded);
+    /* Braking and fleeing are compared as they are meant. */
+    braking = clearance_after(&none, &at, brake_B, &after, -unbounded);
     (void)twice_energy(&at.body, &momentum);
     /* Of a slow state the clearance is known well, and what is no worse will do; inside a zone any way out is good. */
     if (momentum <= slow_steps * brake_limit * KOZ_STEP_SECONDS || nearest <= 0.0f) at.present = braking;
     present = at.present;
     /* Straight away from a zone that comes is good at any speed. */
-    if (cone_rate > 0.0f) at.present = braking;
+    if (approach > 0.0f) at.present = braking;
     least = smaller(0.5f * shield_margin, at.present);
-    if (braking < 0.5f * shield_margin && passes(&at, 1.0f, away_B, away_B, least, allowed_B)) return;
+    if (braking < 0.5f * shield_margin && is_allowed(&none, &at, away_B, least)) {
+        for (i = 0; i < 3; i++) allowed_B[i] = away_B[i];
+        return;
+    }
     at.present = present;
     least = smaller(shield_margin, at.present + least_gain);
     for (i = 0; i < REQUEST_SHARES; i++)
