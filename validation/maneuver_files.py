@@ -55,6 +55,8 @@ class FilesArgs:
 
     files: int = 1000
     """Number of files, of every kind as many."""
+    first: int = 0
+    """Number of the first file, to go on after an interruption."""
     seed: int = 0
     """Seed of the draw; file i of a seed is always the same."""
     agent: str = "universal"
@@ -138,7 +140,7 @@ def leave_out_self_tests() -> None:
 
 def written(args: FilesArgs, folder: Path, refused: collections.Counter[str]) -> Iterator[tuple[Kind, Path]]:
     """Draw and write files that can be read, the kinds in turn, and count why others cannot."""
-    for number in range(args.files):
+    for number in range(args.first, args.first + args.files):
         kind = KINDS[number % len(KINDS)]
         path = folder / f"file{number:04}.toml"
         for attempt in range(_DRAWS):
