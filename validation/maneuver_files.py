@@ -208,6 +208,7 @@ def report(found: dict[Kind, list[Compared]], refused: collections.Counter[str])
     for kind, rows in found.items():
         print(row(str(kind), rows))
     print(row("all", every))
+    print(f"largest difference of a margin: {described(max(every, key=lambda one: one.margin_deg))}")
     for reason, count in refused.most_common():
         print(f"drawn again {count} times: {reason}")
     return 0 if all(one.excused for one in every if one.differs) else 1
