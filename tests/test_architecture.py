@@ -129,6 +129,7 @@ def test_learning_knows_nothing_of_spacecraft():
         assert {structure.folder_of(name) for name in IMPORTS[module]} <= {"sac", "learners"}, module
 
 
+@pytest.mark.slow
 def test_the_script_prints_floors_and_finds_no_fault():
     done = subprocess.run([sys.executable, SCRIPT], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
@@ -286,11 +287,13 @@ def loaded_by(module: str) -> list[str]:
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
 
 
+@pytest.mark.slow
 def test_importing_what_needs_no_jax_costs_none():
     """Together, in one process: none of them loads anything heavy."""
     assert loaded_by(", ".join(LIGHT)) == []
 
 
+@pytest.mark.slow
 def test_the_check_of_what_is_loaded_does_look():
     assert "jax" in loaded_by("koz_jax.task.rotations")
 

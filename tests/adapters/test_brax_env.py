@@ -25,6 +25,7 @@ def jitted(wrapped):
     return jax.jit(wrapped.step)
 
 
+@pytest.mark.slow
 def test_import_is_silent():
     done = subprocess.run(
         [sys.executable, "-c", "import koz_jax.adapters.brax_env"], capture_output=True, text=True, check=True

@@ -82,6 +82,7 @@ def test_a_step_after_the_end_of_an_episode_is_refused():
     env.step(still)
 
 
+@pytest.mark.slow
 def test_observations_belong_to_the_caller():
     envs = ReorientationVectorEnv(3, TASK)
     seen, _ = envs.reset(seed=0)

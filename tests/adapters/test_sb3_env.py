@@ -16,6 +16,7 @@ from koz_jax.errors import SettingsError
 STILL = np.zeros((3, 3), np.float32)
 
 
+@pytest.mark.slow
 def test_stable_baselines_finds_no_fault():
     with warnings.catch_warnings():
         warnings.simplefilter("error")

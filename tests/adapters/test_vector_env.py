@@ -22,6 +22,7 @@ def vector_state(env, drawn, keys):
     return VectorState(begun, keys, jnp.zeros(len(keys), jnp.int32), jnp.full(len(keys), jnp.inf))
 
 
+@pytest.mark.slow
 def test_environments_do_not_know_of_each_other():
     envs = NumpyVectorEnv(3, SHORT)
     actions = np.random.default_rng(0).uniform(-1, 1, (25, 3, 3))

@@ -122,6 +122,7 @@ def test_what_cannot_be_measured_is_refused_by_name(given, reason):
         Observer((0, 0, 0))
 
 
+@pytest.mark.slow
 def test_the_observer_needs_no_jax():
     code = (
         "import sys; sys.modules.update(dict.fromkeys(('jax', 'flax', 'brax', 'optax')))\n"

@@ -85,6 +85,7 @@ def test_a_damaged_or_foreign_agent_is_refused(saved, tmp_path):
         load_policy(saved)
 
 
+@pytest.mark.slow
 def test_flying_costs_no_jax():
     code = (
         "import sys, numpy; sys.modules.update(dict.fromkeys(('jax', 'flax', 'brax', 'optax')))\n"

@@ -26,6 +26,7 @@ def acts(controller):
     return np.asarray(jax.jit(jax.vmap(controller.act))(SEEN))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["SAC", "TD3", "DDPG"])
 def test_a_policy_of_stable_baselines_acts_as_it_predicts(benchmark, name):
     settings: Any = {"policy_kwargs": {"net_arch": [32, 24]}, "buffer_size": 10, "device": "cpu"}

@@ -33,6 +33,7 @@ def flown(at, model, urgency):
     return seen, action, torque_B
 
 
+@pytest.mark.slow
 def test_it_flies_any_spacecraft_as_the_core_does():
     actions, clipped = [], 0
     for told in spacecraft.situations(250, seed=0):
@@ -51,6 +52,7 @@ def test_it_flies_any_spacecraft_as_the_core_does():
     assert np.std(actions, axis=0).min() > 0.3 and 25 < clipped < 225
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("present", "observed"), [(0, 1), (1, 3), (3, 2)])
 def test_it_sees_the_nearest_zones_and_absent_ones_as_the_core_does(present, observed):
     for told in spacecraft.situations(10, seed=3, zones=present):
@@ -76,6 +78,7 @@ def test_of_several_instruments_the_axes_are_those_of_the_nearest_zones():
         np.testing.assert_allclose(observer.torque(action), limits * share, rtol=1e-5, atol=1e-6 * limits.max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("present", [1, 2, 3, 4])
 def test_of_four_zones_of_three_instruments_it_sees_what_the_core_does(present):
     rng = np.random.default_rng(present)
@@ -163,6 +166,7 @@ def test_a_missing_or_foreign_gain_is_refused(tmp_path):
             load_policy(tmp_path / "agent")
 
 
+@pytest.mark.slow
 def test_it_needs_no_jax(tmp_path):
     AGENT.save(tmp_path / "agent")
     code = (

@@ -96,6 +96,7 @@ BAD = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("argv", "words"), BAD, ids=[argv for argv, _ in BAD])
 @pytest.mark.usefixtures("no_flight")
 def test_bad_input_is_refused_by_name_before_anything_happens(capsys, agent, empty_cwd, argv, words):

@@ -210,6 +210,7 @@ REFUSED_TURNS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REFUSED_TURNS)
 def test_maneuvers_that_cannot_be_flown_are_refused_in_one_line(name, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -70,6 +70,7 @@ def test_registered_controllers_and_agents_are_in_the_help(capsys, name):
         assert known in text
 
 
+@pytest.mark.slow
 def test_registered_names_are_in_the_help_of_the_others(capsys):
     assert all(name in help_of(capsys, "train") for name in PRESETS)
     assert all(name in help_of(capsys, "export") for name in shipped_agents())

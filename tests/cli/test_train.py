@@ -105,6 +105,7 @@ BAD = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("argv", "words"), BAD, ids=[argv[:60] for argv, _ in BAD])
 @pytest.mark.usefixtures("no_training")
 def test_bad_input_is_refused_by_name_before_anything_happens(capsys, monkeypatch, empty_cwd, argv, words):
@@ -140,6 +141,7 @@ def test_several_bad_settings_are_reported_at_once(capsys, empty_cwd):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_training")
 def test_an_existing_run_is_not_overwritten(capsys, run, empty_cwd):
     before = tiny.contents(run.path)
@@ -185,6 +187,7 @@ def test_resume_takes_no_other_settings(capsys, run, empty_cwd, others):
     assert tiny.contents(run.path) == before
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_training")
 def test_a_tampered_run_is_not_resumed(capsys, run, tmp_path, monkeypatch):
     no_shapes(monkeypatch)
@@ -217,6 +220,7 @@ def test_help_names_and_describes_every_setting(capsys):
     assert {"--run", "--resume", "--start-from", "--cases"} <= flags
 
 
+@pytest.mark.slow
 def test_help_cut_short_by_its_reader_ends_quietly():
     with subprocess.Popen(
         [sys.executable, tiny.ROOT / "train.py", "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -233,6 +237,7 @@ def test_help_of_a_preset_shows_its_values(capsys):
         assert "(default: 1000000)" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_every_setting_can_be_given_as_a_flag():
     for name in PRESETS:
         other = "fast" if name == "paper" else "paper"
@@ -363,6 +368,7 @@ def test_a_resumed_run_keeps_the_cases_that_it_was_begun_with(run, tmp_path, cap
     assert files.read_json(folder.evaluation)["cases"] == 5
 
 
+@pytest.mark.slow
 def test_the_command_that_begins_a_run_is_kept_in_its_folder(monkeypatch, tmp_path, capsys):
     def interrupted(*_: Any) -> None:
         raise KeyboardInterrupt

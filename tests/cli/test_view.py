@@ -42,6 +42,7 @@ def test_command_draws_the_case_of_the_monte_carlo(saved, tmp_path, capsys):
     assert "case 3 of seed 5" in out.read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -97,6 +98,7 @@ def test_controllers_shields_and_zones_are_shown(saved, tmp_path, capsys):
     assert capsys.readouterr().out.count("stayed clear of the zone") == 2
 
 
+@pytest.mark.slow
 def test_a_maneuver_of_ones_own_is_shown_as_it_is_flown(saved, tmp_path):
     """By who is named; where nobody is, by who was made for the spacecraft."""
     text = tiny.MANEUVER_FILES["calaon1"].read_text()

@@ -26,6 +26,7 @@ def rested(count, seed):
     return jax.vmap(slews.at_rest)(at, at.body.q_BN)
 
 
+@pytest.mark.slow
 def test_there_are_eighteen_ways_to_turn_and_one_home():
     assert slews.COUNT == 19 and len(np.unique(slews.AXES_B, axis=0)) == 18
     np.testing.assert_allclose(np.linalg.norm(slews.AXES_B, axis=1), 1.0, rtol=1e-6)

@@ -19,6 +19,7 @@ INERTIA_B = np.asarray(YANG.inertia_B, float)
 LOW = 0.1
 
 
+@pytest.mark.slow
 def test_slope_is_that_of_the_potential():
     at = log_barrier.several_instruments()
     found = jax.jit(jax.vmap(LogBarrierPotential(0.3, 0.7).slope))(at.body.q_BN, at.scenario)
@@ -55,6 +56,7 @@ def test_energy_and_potential_together_fall_as_damping_takes():
     log_barrier.check_rates(LeeMesbahiPD(barrier=LOW), YANG, lyapunov)
 
 
+@pytest.mark.slow
 def test_backstepping_makes_its_function_fall_as_designed():
     def lyapunov(q, w, scenario):
         slope_B = log_barrier.slope(q, scenario, 0.0, LOW)

@@ -47,6 +47,7 @@ def _fly(env: Reorientation, controller: AnyAdversary, keys: jax.Array) -> CaseR
     return jax.vmap(one)(keys)
 
 
+@pytest.mark.slow
 def test_the_state_holds_the_constraints_as_they_are_now():
     at = ENV.reset(sweeping(RATE_DEG))
     for _ in range(20):
@@ -56,6 +57,7 @@ def test_the_state_holds_the_constraints_as_they_are_now():
     np.testing.assert_allclose(np.rad2deg(ENV.margin(at)), 60.0 - 20.0 - 2.0 * RATE_DEG, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_body_at_rest_is_entered_by_a_cone_that_comes():
     """After 80 s at 0.5 deg/s, and not before."""
     still = load_controller("pd")

@@ -49,6 +49,7 @@ def flown(name: str) -> tuple[History, np.ndarray]:
     return history, np.asarray(margins)
 
 
+@pytest.mark.slow
 def test_a_disturbance_that_wheels_have_no_torque_to_brake_against_is_refused():
     """Half of their torque is for their own momentum, and does not count; a disturbance may be half of the rest."""
     weakest = min(TASK.spacecraft.torque_limits)

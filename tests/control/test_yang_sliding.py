@@ -1,6 +1,7 @@
 """The published sliding mode, against its potential in float64."""
 
 import numpy as np
+import pytest
 from support import log_barrier
 from support.log_barrier import YANG
 
@@ -15,6 +16,7 @@ def test_gains_are_the_published_ones_on_the_published_spacecraft():
     np.testing.assert_allclose(found, [0.05, 0.01, 2.0, 1e-4, 0.35, 4.0], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_its_function_falls_as_published():
     """V + s' I s / 2, at a rate that is below zero as 8 alpha k > 1.  So the law has the right derivative."""
     inertia_B = np.asarray(YANG.inertia_B, float)
@@ -33,6 +35,7 @@ def test_turning_the_inertial_frame_changes_nothing():
     log_barrier.check_another_frame(YangSliding(), YANG)
 
 
+@pytest.mark.slow
 def test_the_published_maneuver_takes_the_published_time_and_effort():
     """Within a tenth of 70 s and 113.42 N^2 m^2 s."""
     angles_deg, margin_deg, effort = log_barrier.fly_published(YangSliding())

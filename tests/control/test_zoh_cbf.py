@@ -61,6 +61,7 @@ def _single(
     return arrays[0], arrays[1], Halfspaces(*arrays[2:4]), Ellipsoid(*arrays[4:])
 
 
+@pytest.mark.slow
 def test_the_torque_is_that_of_scipys_solver():
     requests, normals, limits, forms, slopes, rooms = _programmes(PROGRAMMES)
     found = nearest(*_single(requests, normals, limits, forms, slopes, rooms))
@@ -123,6 +124,7 @@ def _slopes(look: Look, torque_B: jax.Array, seconds: jax.Array) -> tuple[jax.Ar
     return jnp.concatenate([of(look)[1:], third[None]]), differences
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_motion():
     torques_B = 2.0 * states.directions(50, 4)
     found, expected = _slopes(_looks(50), torques_B, jnp.float32(0.1))
@@ -157,6 +159,7 @@ def test_the_papers_spacecraft_loses_its_authority_at_the_published_rates(angle_
     assert rate_deg - 0.1 < lost < 1.06 * rate_deg
 
 
+@pytest.mark.slow
 def test_up_to_the_published_rate_limit_a_torque_is_found_at_the_edge_of_every_cone():
     limits = made().limits
     assert np.all(np.asarray(limits.failures) == 0.0)
@@ -197,6 +200,7 @@ def _at_the_edge(filtered: ZohCbf, at: EnvState, direction_B: jax.Array) -> EnvS
     return jax.tree.map(lambda leaf: leaf[jnp.argmin(covered) - 1], moving)
 
 
+@pytest.mark.slow
 def test_a_step_from_the_allowed_set_ends_in_it_whatever_is_asked_for():
     at = _with_three_cones(states.random_states(STATES, 7))
     first = jax.tree.map(lambda leaf: leaf[:, 0], at.scenario.constraints)

@@ -120,6 +120,7 @@ def check_make(words):
     assert targets <= make_targets(), targets - make_targets()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in PAGES if page.name != "CHANGELOG.md"], ids=lambda page: page.name)
 def test_command_lines_exist(page):
     for words in command_lines(page):

@@ -83,6 +83,7 @@ def test_cases_differ_and_seeds_differ():
     assert len(np.unique(np.concatenate([found, others, far])[:, 0])) == 12
 
 
+@pytest.mark.slow
 def test_neither_the_number_of_cases_nor_the_chunk_size_matters(flown, monkeypatch):
     monkeypatch.setattr(cases, "_CHUNK", 4)
     # No other test flies 11 cases here, so this compiles with the new size: 11 = 4 + 4 + 3.

@@ -138,6 +138,7 @@ def _one(tree, i: int):
 # The history
 
 
+@pytest.mark.slow
 def test_history_starts_at_the_scenario_and_has_one_row_more_than_steps(histories, stacked):
     assert {leaf.shape[1] for leaf in jax.tree.leaves(histories)} == {STEPS + 1}
     np.testing.assert_array_equal(histories.state.body.q_BN[:, 0], stacked[1].initial.q_BN)
@@ -161,6 +162,7 @@ def test_torque_of_a_row_is_what_the_controller_answers_to_its_state(histories, 
     np.testing.assert_array_equal(histories.torque_B[:, -1], histories.torque_B[:, -2])
 
 
+@pytest.mark.slow
 def test_pointing_error_and_margin_of_a_row_agree_with_the_oracle(histories, twins):
     for i, twin in enumerate(twins):
         np.testing.assert_allclose(histories.pointing_error[i], twin["phi"], atol=RESOLUTION)
@@ -442,6 +444,7 @@ def test_a_start_inside_a_zone_is_named_an_unsafe_one_with_and_without_a_shield(
     assert bool(shielded.unsafe_start)
 
 
+@pytest.mark.slow
 def test_agility_is_what_the_history_shows():
     """Largest rate, total variation of the torque, and the squared action at the end, from the history in float64."""
     agent = load_controller("pd")

@@ -61,6 +61,7 @@ def _results(cases: int) -> CaseResult:
     )
 
 
+@pytest.mark.slow
 def test_a_history_is_a_row_per_instant():
     history, result = cases.fly_case(AGENT, 0, MonteCarloConfig(cases=tiny.CASES, seed=3))
     rows = list(csv.DictReader(io.StringIO(tables.history_csv(history, AGENT.task))))

@@ -64,6 +64,7 @@ def session(agent):
     return onnxruntime.InferenceSession(export(agent, "onnx")["koz_policy.onnx"])
 
 
+@pytest.mark.slow
 def test_the_golden_situations_cover_the_envelope(vectors):
     q_e, omega = vectors.observation[:, :4], vectors.observation[:, 4:7]
     angle = np.rad2deg(oracle.rotation_angle(q_e))
@@ -123,6 +124,7 @@ def test_c_is_strict_and_needs_nothing_but_libm(folder, tmp_path):
     }
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_the_self_test_passes_and_notices_a_changed_weight(folder, tmp_path):
     folder = shutil.copytree(folder, tmp_path / "c")
@@ -321,6 +323,7 @@ def test_a_missing_extra_says_what_to_install(to, missing, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_the_library_needs_no_jax():
     code = "import sys, koz_jax.export.library; print([name for name in ('jax', 'flax') if name in sys.modules])"
     done = tiny.run_python("-c", code)

@@ -70,6 +70,7 @@ def vectors(task):
     return golden(made_for(AGENT, task), COUNT, seed=1)
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_c_flies_it_as_jax_and_numpy_do(task, folder, vectors):
     library, limits = CLibrary(folder), np.array(task.spacecraft.torque_limits)

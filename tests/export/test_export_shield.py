@@ -137,6 +137,7 @@ def test_it_decides_as_the_core_does_where_cones_turn(agent, tmp_path):
     assert done.returncode == 0 and done.stdout.count("passed") == 2, done.stdout + done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", [CONFIG, ROBUST], ids=["plain", "robust"])
 def test_golden_vectors_are_of_every_kind(agent, config):
     drawn = shield_golden(agent, config, 100)
@@ -232,6 +233,7 @@ def test_only_directions_count(library, vectors):
     assert np.mean(same) > 0.99
 
 
+@pytest.mark.slow
 def test_the_command_line_asks_for_it(tmp_path, capsys):
     tiny.untrained_agent().save(tmp_path / "agent")
     where = [str(tmp_path / "agent"), "--out", str(tmp_path / "c")]

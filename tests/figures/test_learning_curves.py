@@ -69,6 +69,7 @@ def test_the_papers_lines_are_drawn_for_the_papers_task_only(configs, expected, 
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1e-9, 1e-6, 0.01, 1.0, 1e4])
 def test_numbers_are_apart_and_in_one_form(factor, tmp_path):
     shown = learning.read_curves([metrics_log(tmp_path / "run", factor)])
@@ -107,6 +108,7 @@ def test_runs_of_other_lengths_are_not_mixed(tmp_path, capsys):
     )
 
 
+@pytest.mark.slow
 def test_learning_curves_are_written(tmp_path, capsys):
     out = tmp_path / "new" / "out"
     runs = [metrics_log(tmp_path / "a"), metrics_log(tmp_path / "b", 2.0)]

@@ -159,6 +159,7 @@ def test_the_same_figure_gives_the_same_bytes(tmp_path):
     assert contents[0] == contents[1]
 
 
+@pytest.mark.slow
 def test_the_moving_picture_is_short_and_small():
     history, result, task = flown("phase2")
     content = animation.gif(history, result, task, "a title")

@@ -64,6 +64,7 @@ def test_where_all_settle_there_is_no_strip():
     assert "never" not in labels_of(figure.axes[1].yaxis)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effort", "all_settle"), [(1e-9, False), (3.4e-6, False), (1.0, False), (1e4, False), (1.0, True)]
 )

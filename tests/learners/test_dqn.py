@@ -47,6 +47,7 @@ def reference_update(learner, batch, rate):
     ), loss(old.values)
 
 
+@pytest.mark.slow
 def test_a_chain_of_updates_is_that_of_the_reference():
     found = DQN.init(jax.random.key(0))
     # Another network for the target: it must matter which of the two chooses, and which is asked for the value.
@@ -71,6 +72,7 @@ def test_a_share_of_actions_is_at_random():
         assert set(np.unique(found)) <= set(range(4))
 
 
+@pytest.mark.slow
 def test_values_of_a_walk_are_the_steps_that_are_left():
     """Places 0 to 4 on a line, of which 4 ends the walk; back, stay, on; each step costs one."""
     walk = Dqn(hidden_sizes=(32, 32), encoding=(), observation_size=1, actions=3, soft_update=0.05, average=0.02)

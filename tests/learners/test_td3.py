@@ -100,6 +100,7 @@ def reference_update(algorithm, learner, batch, key, rate):
     ), metrics | {"actor_loss": actor_loss(old.policy), "policy_gradient": norm(gradient)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", [TD3, DDPG], ids=["td3", "ddpg"])
 def test_a_chain_of_updates_is_that_of_the_reference(algorithm):
     found = in_midst_of_training(algorithm, 0)
@@ -129,6 +130,7 @@ def test_exploration_is_the_policy_with_noise_and_stays_within_bounds():
     assert np.max(np.abs(action)) <= 1.0
 
 
+@pytest.mark.slow
 def test_policy_acts_for_a_reward_that_comes_later():
     sizes = {name: getattr(probes.SAC, name) for name in SHARED.keys() - {"exploration_noise"}}
     algorithm = Td3(**SHARED | sizes, target_noise=0.1, target_noise_clip=0.2, policy_delay=2)

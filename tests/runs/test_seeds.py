@@ -116,6 +116,7 @@ def test_sigterm_is_handed_on_to_all_workers(tmp_path, monkeypatch):
     assert time.monotonic() - begun < 100
 
 
+@pytest.mark.slow
 def test_bad_numbers_of_seeds_and_used_folders_are_refused(tmp_path, capsys):
     for count in (0, -1, 1001):
         assert tiny.status("train", "--seeds", count, "--run", tmp_path / "run") == 2

@@ -113,6 +113,7 @@ def kernels(params):
     return [leaf for path, leaf in jax.tree.leaves_with_path(params) if "kernel" in jax.tree_util.keystr(path)]
 
 
+@pytest.mark.slow
 def test_initial_parameters_are_bounded_as_in_torch_linear(policy, critic):
     for _, params in (policy, critic):
         for path, layer in jax.tree.leaves_with_path(params, is_leaf=lambda node: "kernel" in node):

@@ -137,6 +137,7 @@ def slow_n_step(window, reward, gamma):
     return np.array(rewards), np.array(discounts), np.array(nexts)
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**31 - 1),

@@ -121,6 +121,7 @@ def twin(setting: Setting) -> dict[str, np.ndarray]:
     }
 
 
+@pytest.mark.slow
 def test_attitude_and_rate_follow_the_oracle(flight, twin):
     np.testing.assert_allclose(flight.states.body.q_BN, twin["q"], atol=ATOL)
     np.testing.assert_allclose(flight.states.body.omega_BN_B, twin["omega"], atol=1e-5)
@@ -520,6 +521,7 @@ def test_without_uncertainty_the_truth_is_the_model_and_measured_exactly(start, 
     jax.tree.map(np.testing.assert_array_equal, env.measure(start, jax.random.key(0)), start)
 
 
+@pytest.mark.slow
 def test_the_reward_of_a_step_is_that_of_its_outcome(start, env):
     stepped = step(env, start, jnp.array([0.5, -0.2, 0.1]))
     expected = reward.terms(stepped.outcome, env.reward, env.nominal_limits)

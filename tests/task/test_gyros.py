@@ -56,6 +56,7 @@ def _flown(held: int = 40, steps: int = 600) -> tuple[EnvState, np.ndarray]:
     return fly(ENV, commands), np.asarray(commands)
 
 
+@pytest.mark.slow
 def test_total_angular_momentum_stays():
     flown, _ = _flown()
     stored = np.asarray(jax.vmap(made().gimbals.momentum)(flown.actuators.angles), np.float64)

@@ -175,6 +175,7 @@ def _only(state: EnvState, zone: int) -> EnvState:
 ZONE_PARTS = ("zone_margin", "zone_angle", "zone_direction_B")
 
 
+@pytest.mark.slow
 def test_several_zones_are_seen_nearest_first_each_as_if_it_were_alone(drawn):
     state = _crowded(drawn, 4)
     found, where = observation.observe(state, 3), observation_layout.slices(3)
@@ -206,6 +207,7 @@ def test_places_for_zones_that_are_not_there_read_far_away(drawn):
         np.testing.assert_allclose(np.concatenate(values), [np.pi, np.pi, 0.0, 0.0, 0.0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_of_two_instruments_the_one_nearest_to_its_zone_is_seen(drawn):
     """The first 16 numbers are those of the pair with the smallest margin, boresight included; the rest follow."""
     state = _crowded(drawn, 2)

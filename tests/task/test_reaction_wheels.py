@@ -64,6 +64,7 @@ def _fly(env: Reorientation, key: jax.Array, steps: int, held: int = 10) -> EnvS
     return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states)
 
 
+@pytest.mark.slow
 @every_set
 def test_total_angular_momentum_stays(wheels):
     env = Reorientation.from_config(task_with(wheels))
@@ -77,6 +78,7 @@ def test_total_angular_momentum_stays(wheels):
     assert np.linalg.norm(total_N - total_N[0], axis=1).max() < 1e-5 * scale
 
 
+@pytest.mark.slow
 @every_set
 def test_no_wheel_passes_its_torque_or_its_momentum(wheels):
     limit = 0.006
@@ -142,6 +144,7 @@ def _difference(wheels: tuple[WheelConfig, ...], step_seconds: float) -> float:
     return float(jnp.linalg.norm(moved.omega_BN_B - without.omega_BN_B))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wheels", [three(0.008), pyramid(0.008)], ids=["three", "pyramid"])
 def test_the_body_moves_as_one_without_wheels_but_for_the_square_of_the_step(wheels):
     coarse, fine = _difference(wheels, 1.0), _difference(wheels, 0.5)

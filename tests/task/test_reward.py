@@ -172,6 +172,7 @@ def test_effort_is_minus_the_squared_norm_of_the_action(full):
     assert found["effort"] == pytest.approx(-np.sum(action**2), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_largest_torque_of_unequal_limits_costs_five_hundredths(full):
     """|tau_max| is the norm of the box's corner, and effort counts shares of the limits' mean square."""
     limits = np.array([0.5, 1.0, 3.0])

@@ -274,6 +274,7 @@ def crowded() -> Scenario:
     return _draw(_ranges(80.0, 180.0, SEVERAL), RESAMPLE)
 
 
+@pytest.mark.slow
 def test_every_zone_leaves_start_and_target_free_and_a_gap_to_the_others(crowded):
     present = np.asarray(crowded.constraints.half_angle) > 0.0
     axes, half_angles = np.asarray(crowded.constraints.axis_N), np.asarray(crowded.constraints.half_angle)
@@ -302,6 +303,7 @@ def test_the_first_zone_and_all_else_do_not_depend_on_how_many_zones_there_are(c
         np.testing.assert_allclose(one, many, rtol=5e-7, atol=1e-7)  # two programs
 
 
+@pytest.mark.slow
 def test_zones_of_several_instruments_leave_start_and_target_clear_and_a_gap_to_those_of_the_same_instrument():
     others_B = jnp.array([[0.0, 1.0, 0.0], [0.0, -0.6, 0.8]])
     many = ScenarioConfig(min_zones=1, max_zones=4)

@@ -62,6 +62,7 @@ def test_noise_has_its_size_and_its_bound_and_spares_the_rest(errors, env):
     )
 
 
+@pytest.mark.slow
 def test_an_environment_flies_its_uncertainty_and_measures_anew_at_every_step(errors, env):
     """A maneuver's truth is that of its key, and its noise that of its key and step."""
     uncertain = env.replace(uncertainty=errors)

@@ -69,6 +69,7 @@ def points(maneuver, name):
     return np.array([trace[axis] for axis in "xyz"], float).T
 
 
+@pytest.mark.slow
 def test_file_stands_alone_and_is_small(text):
     assert len(text.encode()) < LONGEST
     # The library holds addresses of maps that are never asked for; the page itself names none.

@@ -42,6 +42,7 @@ def angles(way):
     return 2.0 * np.arccos(np.clip(np.sum(way[1:] * way[:-1], axis=1), -1.0, 1.0))
 
 
+@pytest.mark.slow
 def test_attitudes_are_even_in_angle_and_keep_the_ends(smoothed):
     way = smoothed[0][0]
     found = angles(way)

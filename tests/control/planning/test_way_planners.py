@@ -72,6 +72,7 @@ def planned(request):
     return starts, timings, jax.tree.map(lambda leaf: np.asarray(leaf, float), samples)
 
 
+@pytest.mark.slow
 def test_paths_clear_all_zones_of_the_maze_and_anywhere(planned):
     starts, _, samples = planned
     zones = starts.scenario.constraints
@@ -81,6 +82,7 @@ def test_paths_clear_all_zones_of_the_maze_and_anywhere(planned):
     assert 0.3 < margins[0] < 2.0 and np.all(margins > 0.3)
 
 
+@pytest.mark.slow
 def test_paths_lead_from_the_start_to_the_target_with_its_sign(planned):
     starts, timing, samples = planned
     np.testing.assert_allclose(samples.q_BN[:, 0], starts.body.q_BN, atol=3e-6)

@@ -24,6 +24,7 @@ def drawn() -> Reorientation:
     return jax.jit(jax.vmap(env.drawn))(jax.random.split(jax.random.key(1), COUNT))
 
 
+@pytest.mark.slow
 def test_every_body_can_be_and_is_no_thinner_than_stated(drawn):
     inertia = np.asarray(drawn.model.inertia_B, np.float64)
     np.testing.assert_allclose(inertia, inertia.transpose(0, 2, 1), atol=1e-3)
@@ -68,6 +69,7 @@ def test_instruments_and_principal_axes_point_anywhere(drawn):
     np.testing.assert_allclose((longest**2).mean(axis=0), 1 / 3, atol=0.03)
 
 
+@pytest.mark.slow
 def test_scenarios_are_for_the_instrument_that_was_drawn():
     env = Reorientation.from_config(TASK).drawn(jax.random.key(4))
     assert jnp.array_equal(env.sample(jax.random.key(2)).constraints.boresight_B[0], env.ranges.boresight_B)
@@ -111,6 +113,7 @@ def test_slender_bodies_are_as_slender_as_asked_for():
     assert np.ptp(shares) > 0.04
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("wheels", "count"), [("three", 3), ("pyramid", 4)])
 def test_wheels_have_the_strength_of_the_spacecraft_and_a_bias(wheels, count):
     task = TaskConfig(spread=SpreadConfig(spacecraft=True, wheels=wheels, wheel_momentum=(1.0, 4.0)))
@@ -131,6 +134,7 @@ def test_wheels_without_spacecraft_are_refused():
         checked(SpreadConfig, wheels="three")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 def test_nominal_maneuvers_have_no_errors_fewest_zones_and_the_largest_rate_limit(share):
     errors = UncertaintyConfig(inertia_error=0.1, rate_noise_deg=0.001, delay_steps=1)

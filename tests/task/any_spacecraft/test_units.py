@@ -38,6 +38,7 @@ def test_the_axes_are_the_bodys_for_an_instrument_along_x_and_a_rotation_also_al
     np.testing.assert_array_equal(units.policy_axes(jnp.array([-1.0, 0.0, 0.0])), np.diag([-1.0, -1.0, 1.0]))
 
 
+@pytest.mark.slow
 def test_the_axes_are_a_continuous_function_of_the_instrument():
     away = _DIRECTIONS[_DIRECTIONS[:, 0] > -0.9]
     nudged = jax.vmap(rotations.normalize)(away + 1e-3 * jnp.array([[0.3, -0.5, 0.8]]))
