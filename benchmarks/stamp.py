@@ -1,5 +1,6 @@
 """What a table needs beside its numbers: the command that made it, the commit, and the machine."""
 
+import functools
 import os
 import platform
 import shlex
@@ -60,8 +61,9 @@ def row(cells: list[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
+@functools.cache
 def commit() -> str:
-    """Abbreviated commit of the checkout, marked where tracked files differ from it."""
+    """Abbreviated commit of the checkout, marked where tracked files differ from it before a table is written."""
     command = ["git", "-C", str(_ROOT), "describe", "--always", "--abbrev=7", "--exclude=*", "--dirty=+changes"]
     found = subprocess.run(command, capture_output=True, text=True, check=False)
     return found.stdout.strip() or "unknown"

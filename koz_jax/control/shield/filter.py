@@ -198,24 +198,8 @@ def from_config(config: ShieldConfig, model: Model) -> Shield:
             (errors.rate_noise_deg, errors.rate_bias_deg),
         )
     )
-    moments = jnp.linalg.eigvalsh(model.inertia_B)
     seconds = guide.take_up_seconds(limits, model)
-    cone_rate = jnp.deg2rad(jnp.float32(config.cone_rate_deg))
-    disturbance = jnp.float32(errors.disturbance_torque)
-    brake = Brake(
-        torque=brake_torque - disturbance,
-        inertia_error=jnp.float32(errors.inertia_error),
-        disturbance=disturbance,
-        rate_error=rate_error,
-        cone_rate=cone_rate,
-        # A rate that is measured wrongly is held as if it were none, and a disturbance is balanced where the guide asks
-        # for a rate that takes as much torque.
-        approach=cone_rate + rate_error + disturbance * seconds / moments[0],
-        soon=guide.soon(seconds, model.dt),
-        smallest_moment=moments[0],
-        largest_moment=moments[2],
-        samples=config.samples,
-    )
+    brake = _brake(config, brake_torque, rate_error, seconds, model)
     margin = jnp.deg2rad(jnp.float32(config.margin_deg)) + 2.0 * attitude_error
     return Shield(
         margin=margin,
@@ -223,6 +207,33 @@ def from_config(config: ShieldConfig, model: Model) -> Shield:
         brake=brake,
         guide=guide.from_config(config, brake, margin, seconds, limits, model),
         rate_limit=rate_limit.from_model(model, rate_error),
+    )
+
+
+def _brake(
+    config: ShieldConfig, brake_torque: jax.Array, rate_error: jax.Array, seconds: jax.Array, model: Model
+) -> Brake:
+    """Make a brake.  brake_torque: () [N m] that is there; rate_error: () [rad/s]; seconds: () [s] of the guide."""
+    errors = config.error_bounds
+    moments = jnp.linalg.eigvalsh(model.inertia_B)
+    cone_rate = jnp.deg2rad(jnp.float32(config.cone_rate_deg))
+    disturbance = jnp.float32(errors.disturbance_torque)
+    # A rate that is measured wrongly is held as if it were none, and a disturbance is balanced where the guide asks for
+    # a rate that takes as much torque.
+    approach = cone_rate + rate_error + disturbance * seconds / moments[0]
+    torque = brake_torque - disturbance
+    return Brake(
+        torque=torque,
+        inertia_error=jnp.float32(errors.inertia_error),
+        disturbance=disturbance,
+        rate_error=rate_error,
+        cone_rate=cone_rate,
+        # With the time in which the torque takes up a rate that is twice as large.
+        approach=approach,
+        soon=guide.soon(seconds, model.dt) + 2.0 * approach * moments[2] / torque,
+        smallest_moment=moments[0],
+        largest_moment=moments[2],
+        samples=config.samples,
     )
 
 
