@@ -80,7 +80,7 @@ class ShieldConfig(Settings):
         torque_limits: [N m] about each body axis, that can be braked with.
 
         Raises:
-            SettingsError: the disturbance is half as strong.
+            SettingsError: the disturbance is not weaker than half of the weakest axis.
 
         """
         disturbance = self.error_bounds.disturbance_torque

@@ -124,7 +124,7 @@ def shield_situations(
     half_angle = np.asarray(drawn.zone_half_angle[:, 0])
     margin = np.where(
         kind == _EDGE,
-        float(made.margin) * rng.uniform(*_EDGE_MARGINS, count),
+        float(made.guide.margin) * rng.uniform(*_EDGE_MARGINS, count),
         -half_angle * rng.uniform(0.0, _DEEPEST, count),
     )
     which = drawn.zone_instrument

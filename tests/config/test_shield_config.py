@@ -35,7 +35,7 @@ def test_error_bounds_are_checked_under_either_name(name):
 
 
 @pytest.mark.parametrize("limits", [(2.0, 2.0, 2.0), (3.0, 2.0, 5.0)])
-def test_a_disturbance_must_be_half_as_strong_as_the_weakest_axis(limits):
+def test_a_disturbance_must_be_weaker_than_half_of_the_weakest_axis(limits):
     """Weaker than half of it: with more, bodies were found that were pushed into a zone."""
     ShieldConfig(error_bounds=UncertaintyConfig(disturbance_torque=0.99)).check(limits)
     for torque in (1.0, 2.5):

@@ -25,15 +25,19 @@ class Brake(struct.PyTreeNode):
     cone_rate: jax.Array  # () [rad/s] largest rate of a cone's axis
     approach: jax.Array  # () [rad/s] with which all of these may bring a zone closer while the craft is held at rest
     soon: jax.Array  # () [s] in which it is led away, during which this is counted alike whatever is decided
+    later: jax.Array  # () [rad/s] the same after that time
     smallest_moment: jax.Array  # () [kg m^2] of inertia, a
     largest_moment: jax.Array  # () [kg m^2] c
     samples: int = struct.field(pytree_node=False)  # of a brake path
 
     def without_errors(self, meant: jax.Array) -> "Brake":
-        """The brake as it is meant, of no other inertia and undisturbed, where that is asked for.  meant: () bool."""
+        """The brake as it is meant, where that is asked for: of no other inertia, undisturbed, with zones that come
+        closer as long as it is led away from them.  meant: () bool.
+        """
         return self.replace(
             inertia_error=jnp.where(meant, 0.0, self.inertia_error),
             disturbance=jnp.where(meant, 0.0, self.disturbance),
+            later=jnp.where(meant, 0.0, self.later),
         )
 
 
@@ -257,7 +261,7 @@ def _tolerance(brake: Brake, motion: _Motion, length: jax.Array, pushed: jax.Arr
         drift=2.0 * pushed,
         integration=brake.samples * (motion.rate * length / brake.samples) ** 5 / 120.0,
         soon=brake.approach * brake.soon,
-        swept=brake.approach * jnp.maximum(motion.momentum / brake.torque - (brake.soon - 2.0 * dt), 0.0),
+        swept=brake.later * jnp.maximum(motion.momentum / brake.torque - (brake.soon - 2.0 * dt), 0.0),
     )
 
 

@@ -56,8 +56,8 @@ class Shield(struct.PyTreeNode):
     def covers(self, at: EnvState, model: Model) -> jax.Array:
         """Whether the guarantee holds from this state on: braking keeps the margin.  Returns () bool.
 
-        Braking itself is possible for actuators that store momentum only below their largest rate, and they hold
-        against a disturbance only where that is not zero.
+        Braking itself is possible for actuators that store momentum only below their largest rate, and to lead away
+        from what comes closer only where they leave a rate for that.
         """
         safe = is_safe(self, at.body, at.scenario.constraints, model) & _is_finite(at.body)
         away = (2.0 * self.brake.approach <= self.guide.rate) | (self.brake.approach == 0.0)
@@ -71,7 +71,8 @@ class Shield(struct.PyTreeNode):
         limit = self.in_state(at, model).rate_limit
         if limit is None:
             return safe
-        holds = (limit.squared > 0.0) | (self.brake.disturbance == 0.0)
+        # A rate of twice that of the approach, whose largest in free motion is at most sqrt(2) times as large.
+        holds = (limit.squared >= 8.0 * self.brake.approach**2) & ((limit.squared > 0.0) | (self.brake.approach == 0.0))
         return safe & holds & (limit.squared_peak(at.body) <= limit.squared)
 
     def allow(self, measured: EnvState, action: jax.Array, model: Model) -> Allowed:
@@ -230,6 +231,7 @@ def _brake(
         cone_rate=cone_rate,
         # With the time in which the torque takes up a rate that is twice as large.
         approach=approach,
+        later=approach,
         soon=guide.soon(seconds, model.dt) + 2.0 * approach * moments[2] / torque,
         smallest_moment=moments[0],
         largest_moment=moments[2],

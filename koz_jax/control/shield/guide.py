@@ -27,7 +27,7 @@ _RATE_SHARE = 0.5
 AHEAD = 2.0
 
 
-# And steps in which a slow craft comes to rest, whatever it is asked for, with the one that is decided on.
+# Steps in which a slow craft comes to rest, whatever it is asked for, with the one that is decided on.
 _STEPS = 6.0
 
 

@@ -56,10 +56,11 @@ typedef struct {
 typedef struct {
     float inertia;     /* relative error */
     float disturbance; /* [N m] */
+    float later;       /* [rad/s] with which a zone comes closer after the time in which it is led away from */
 } errors;
 
-static const errors stated = {@INERTIA_ERROR@, @DISTURBANCE@};
-static const errors none = {0.0f, 0.0f};
+static const errors stated = {@INERTIA_ERROR@, @DISTURBANCE@, @APPROACH@};
+static const errors none = {0.0f, 0.0f, 0.0f};
 
 /* Vectors in body axes that are fixed in inertial ones: the angular momentum first, then the zones' axes. */
 typedef struct {
@@ -228,7 +229,7 @@ static tolerance tolerance_of(const errors *doubt, float momentum, float rate, f
     found.drift = 2.0f * push_error;
     found.integration = (float)SAMPLES * piece * piece * piece * piece * piece / 120.0f;
     found.soon = approach * soon;
-    found.swept = approach * larger(momentum / brake_limit - (soon - 2.0f * KOZ_STEP_SECONDS), 0.0f);
+    found.swept = doubt->later * larger(momentum / brake_limit - (soon - 2.0f * KOZ_STEP_SECONDS), 0.0f);
     return found;
 }
 
@@ -411,7 +412,7 @@ int koz_is_safe(const koz_situation *now)
     const body_state body = body_of(&unit);
     if (2.0f * approach > guide_rate) return 0;
 @WHEELS@    if (!(squared_peak(body.omega_BN_B) <= squared_limit(&unit))) return 0;
-@WHEELS@    if (stated.disturbance > 0.0f && !(squared_limit(&unit) > 0.0f)) return 0;
+@WHEELS@    if (approach > 0.0f && !(squared_limit(&unit) >= 8.0f * approach * approach)) return 0;
     return koz_fault(now) == NULL && clearance(&stated, &unit, &body, 0.0f, shield_margin) >= shield_margin;
 }
 
@@ -504,6 +505,8 @@ static void allow(const koz_situation *now, const float requested_B[3], float al
 @WHEELS@    koz_wheels_limits(now, limit_B);
     for (i = 0; i < 3; i++) request_B[i] = larger(-@NOW_LIMIT_OF_I@, smaller(@NOW_LIMIT_OF_I@, requested_B[i]));
     brake(&at.body, brake_B);
+    for (i = 0; i < 3; i++)
+        if (!isfinite(requested_B[0]) || !isfinite(requested_B[1]) || !isfinite(requested_B[2])) request_B[i] = brake_B[i];
     limit_rate(&at.body, @RATE_ARGUMENT@brake_B, request_B);
     if (passes(&at, 1.0f, request_B, request_B, shield_margin, allowed_B)) return;
 
