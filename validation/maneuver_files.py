@@ -31,6 +31,7 @@ from koz_jax.agents.agent import Agent, load_agent
 from koz_jax.cli.exit_status import exit_status
 from koz_jax.config.maneuvers.maneuver import ManeuverConfig
 from koz_jax.config.maneuvers.maneuver_file import load_maneuver, load_spacecraft
+from koz_jax.config.maneuvers.maneuver_tables import fastest_cone_deg
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.errors import SettingsError
 from koz_jax.export import files as exports
@@ -188,8 +189,7 @@ def in_c(agent: Agent, path: Path, maneuver: ManeuverConfig, shield: ShieldConfi
     described = load_spacecraft(path)
     told = None
     if shield is not None:
-        rates = [float(np.linalg.norm(one.rotation_deg)) for one in maneuver.constraints]
-        told = shield.model_copy(update={"cone_rate_deg": max(rates)})
+        told = shield.model_copy(update={"cone_rate_deg": fastest_cone_deg(maneuver.constraints)})
     further = tuple(instrument.boresight for instrument in described.instruments[1:])
     with tempfile.TemporaryDirectory() as folder:
         exports.write_files(Path(folder), exports.export(agent, "c", told, described.task, further))

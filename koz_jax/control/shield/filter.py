@@ -129,8 +129,8 @@ class Shield(struct.PyTreeNode):
             flees = (number == _AWAY) & (self.brake.approach > 0.0)
             present = jnp.where(lenient | flees, search.braking, jnp.inf)
             least = self._least(number, present)
-            # Of a wrong inertia, or disturbed, braking and fleeing do more or less than they should, but nothing else:
-            # they are compared as they are meant.  Others are not, or to coast on would do, and less at every step.
+            # Of a wrong inertia, or disturbed, braking and fleeing mostly do more or less than they should: they are
+            # compared as they are meant.  Others are not, or to coast on would do, and less at every step.
             brake = self.brake.without_errors((number == _BRAKE) | (number == _AWAY))
             pushed = brake_path.push_error(brake, body, candidate_B, model)
             needed = jnp.where(number == _BRAKE, -jnp.inf, least)
@@ -229,9 +229,9 @@ def _brake(
         disturbance=disturbance,
         rate_error=rate_error,
         cone_rate=cone_rate,
-        # With the time in which the torque takes up a rate that is twice as large.
         approach=approach,
         later=approach,
+        # With the time in which the torque takes up a rate that is twice as large.
         soon=guide.soon(seconds, model.dt) + 2.0 * approach * moments[2] / torque,
         smallest_moment=moments[0],
         largest_moment=moments[2],

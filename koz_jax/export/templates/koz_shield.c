@@ -505,8 +505,8 @@ static void allow(const koz_situation *now, const float requested_B[3], float al
 @WHEELS@    koz_wheels_limits(now, limit_B);
     for (i = 0; i < 3; i++) request_B[i] = larger(-@NOW_LIMIT_OF_I@, smaller(@NOW_LIMIT_OF_I@, requested_B[i]));
     brake(&at.body, brake_B);
-    for (i = 0; i < 3; i++)
-        if (!isfinite(requested_B[0]) || !isfinite(requested_B[1]) || !isfinite(requested_B[2])) request_B[i] = brake_B[i];
+    if (!isfinite(requested_B[0]) || !isfinite(requested_B[1]) || !isfinite(requested_B[2]))
+        for (i = 0; i < 3; i++) request_B[i] = brake_B[i];
     limit_rate(&at.body, @RATE_ARGUMENT@brake_B, request_B);
     if (passes(&at, 1.0f, request_B, request_B, shield_margin, allowed_B)) return;
 
