@@ -68,7 +68,8 @@ def rate_at_start(spacecraft: SpacecraftConfig) -> float:
     if spacecraft.gyros:
         allowed = min(allowed, _left_of_gyros(spacecraft) / largest_moment)
     if spacecraft.wheels:
-        allowed = min(allowed, _of_wheels(spacecraft))
+        momentum = np.array([wheel.momentum for wheel in spacecraft.wheels])
+        allowed = min(allowed, rate_of_wheels(spacecraft, momentum, np.zeros(3)))
     return max(allowed, 0.0)
 
 
@@ -95,16 +96,22 @@ def _left_of_gyros(spacecraft: SpacecraftConfig) -> float:
     return float(np.mean([gyro.momentum for gyro in spacecraft.gyros]) - np.linalg.norm(held_B))
 
 
-def _of_wheels(spacecraft: SpacecraftConfig) -> float:
-    """Largest rate [rad/s] that no wheel is full at, and at which half of the torque is left."""
-    own, box_B = spacecraft.wheels, spacecraft.torque_limits
-    momentum, most = (np.array([getattr(wheel, name) for wheel in own]) for name in ("momentum", "max_momentum"))
+def rate_of_wheels(
+    spacecraft: SpacecraftConfig, momentum: npt.NDArray[np.float64], omega_BN_B: npt.NDArray[np.float64]
+) -> float:
+    """Largest rate [rad/s] that no wheel is full at, and at which half of the torque is left; below 0 where none is.
+
+    As of ``task.actuators.ReactionWheels``.  momentum: of each wheel (wheels,) [N m s]; omega_BN_B: (3,) [rad/s].
+    """
+    own, inertia_B = spacecraft.wheels, np.array(spacecraft.inertia)
     held_B = momentum @ np.array([wheel.axis for wheel in own])
-    allocation, total = wheels.allocation(own), float(np.linalg.norm(held_B))
-    smallest, _, largest = np.linalg.eigvalsh(np.array(spacecraft.inertia))
+    allocation, total = wheels.allocation(own), float(np.linalg.norm(inertia_B @ omega_BN_B + held_B))
+    smallest, _, largest = np.linalg.eigvalsh(inertia_B)
     idle = np.abs(momentum - allocation @ held_B)
+    most = np.array([wheel.max_momentum for wheel in own])
     room = float(np.min((most - idle) / np.linalg.norm(allocation, axis=1))) - total
-    reserve = (1.0 - wheels.BRAKE_SHARE) * min(box_B)
+    # The rate w at which the gyroscopic torque, (c - a) w^2 / 2 + w |H|, is what braking leaves of the torque.
+    reserve = (1.0 - wheels.BRAKE_SHARE) * min(spacecraft.torque_limits)
     divisor = total + math.sqrt(total**2 + 2.0 * float(largest - smallest) * reserve)
     by_torque = 2.0 * reserve / divisor if divisor > 0.0 else math.inf
     return min(room / float(largest), by_torque)

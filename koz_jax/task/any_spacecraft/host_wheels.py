@@ -3,7 +3,8 @@
 import numpy as np
 
 from koz_jax.config.actuators import wheels
-from koz_jax.config.actuators.wheels import BRAKE_SHARE, LEAST_SHARE
+from koz_jax.config.actuators.agility import rate_of_wheels
+from koz_jax.config.actuators.wheels import LEAST_SHARE
 from koz_jax.config.task import SpacecraftConfig
 from koz_jax.task.host import Floats
 
@@ -13,13 +14,13 @@ class HostWheels:
 
     def __init__(self, spacecraft: SpacecraftConfig) -> None:
         """Take the wheels of a spacecraft, which has at least three."""
-        own = spacecraft.wheels
+        self._spacecraft, own = spacecraft, spacecraft.wheels
         self._axes_B = np.array([wheel.axis for wheel in own])
         self._allocation = wheels.allocation(own)
         self._max_torque = np.array([wheel.max_torque for wheel in own])
         self._max_momentum = np.array([wheel.max_momentum for wheel in own])
         self._box_B, self._inertia_B = np.array(spacecraft.torque_limits), np.array(spacecraft.inertia)
-        self._max_rate = np.inf if spacecraft.max_rate_deg is None else np.deg2rad(spacecraft.max_rate_deg)
+        self._max_rate = np.inf if spacecraft.max_rate_deg is None else float(np.deg2rad(spacecraft.max_rate_deg))
         self.momentum_at_start: Floats = np.array([wheel.momentum for wheel in own])
 
     def share(self, momentum: Floats, omega_BN_B: Floats) -> float:
@@ -30,16 +31,7 @@ class HostWheels:
 
     def largest_rate(self, momentum: Floats, omega_BN_B: Floats) -> float:
         """Largest rate [rad/s] that the body may have and the wheels can stop."""
-        held_B = momentum @ self._axes_B
-        total = np.linalg.norm(self._inertia_B @ omega_BN_B + held_B)
-        smallest, _, largest = np.linalg.eigvalsh(self._inertia_B)
-        idle = np.abs(momentum - self._allocation @ held_B)
-        room = np.min((self._max_momentum - idle) / np.linalg.norm(self._allocation, axis=1)) - total
-        # The rate w at which the gyroscopic torque, (c - a) w^2 / 2 + w |H|, is what braking leaves of the torque.
-        reserve = (1.0 - BRAKE_SHARE) * np.min(self._box_B)
-        divisor = total + np.sqrt(total**2 + 2.0 * (largest - smallest) * reserve)
-        by_torque = 2.0 * reserve / divisor if divisor > 0.0 else np.inf
-        return float(max(min(room / largest, by_torque, self._max_rate), 0.0))
+        return max(min(rate_of_wheels(self._spacecraft, momentum, omega_BN_B), self._max_rate), 0.0)
 
     def torques(self, torque_B: Floats, momentum: Floats, omega_BN_B: Floats, seconds: float) -> Floats:
         """Torque that each wheel gives the body for a time step [N m], by which its own momentum falls.
