@@ -12,7 +12,7 @@ os.environ["JAX_PLATFORMS"] = os.environ.get("KOZ_JAX_TEST_PLATFORM", "cpu")
 # Most of the time goes into compiling: without optimisation that takes less than half, though loops run slower.
 _QUICK = ["--xla_backend_optimization_level=0"]
 if version("jaxlib").startswith("0.10."):  # others end a process at the name of a flag that they do not know
-    _QUICK.append("--xla_cpu_use_fusion_emitters=false")
+    _QUICK += ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
 if os.environ["JAX_PLATFORMS"] == "cpu":
     # Each once: what is compiled is kept by its flags as they are written.
     os.environ["XLA_FLAGS"] = " ".join(dict.fromkeys([*os.environ.get("XLA_FLAGS", "").split(), *_QUICK]))

@@ -265,14 +265,13 @@ def test_a_value_that_is_the_papers_takes_the_place_of_the_agents():
 
 @pytest.mark.slow
 def test_a_platform_that_is_not_there_is_named_in_a_line(empty_cwd, agent):
-    for name in ("cuda", "rocm"):
-        environment = tiny.environment() | {"JAX_PLATFORMS": name}
-        command = [sys.executable, "-m", "koz_jax", "evaluate", "--agent", str(agent), "--cases", "2"]
-        done = subprocess.run(command, env=environment, cwd=empty_cwd, capture_output=True, text=True, check=False)
-        if done.returncode == 0:
-            continue  # it is there
-        (line,) = done.stderr.splitlines()
-        assert done.returncode == 2 and line.startswith(f"error: JAX_PLATFORMS: {name!r} cannot be used (")
+    environment = tiny.environment() | {"JAX_PLATFORMS": "cuda"}
+    command = [sys.executable, "-m", "koz_jax", "evaluate", "--agent", str(agent), "--cases", "2"]
+    done = subprocess.run(command, env=environment, cwd=empty_cwd, capture_output=True, text=True, check=False)
+    if done.returncode == 0:
+        pytest.skip("it is there")
+    (line,) = done.stderr.splitlines()
+    assert done.returncode == 2 and line.startswith("error: JAX_PLATFORMS: 'cuda' cannot be used (")
 
 
 def test_another_spacecraft_is_flown_in_its_own_units(tmp_path):

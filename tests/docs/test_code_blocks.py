@@ -22,6 +22,7 @@ NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 BLOCK = re.compile(r"(?:^<!-- test: (?P<mark>.*?) -->\n)?^```(?P<language>\w+)\n(?P<code>.*?)^```$", re.M | re.S)
 LINK = re.compile(r"\]\((?!https?:)([^)#\s]+)(?:#[^)\s]*)?\)")
 FLAG = re.compile(r"--[a-z][\w.-]*")
+CASES = re.compile(r"\bcases=\d[\d_]*")
 
 
 class Block(NamedTuple):
@@ -45,7 +46,7 @@ WITH_PYTHON = [
 @pytest.mark.slow
 @pytest.mark.parametrize("page", WITH_PYTHON)
 def test_python_blocks_run(page, tmp_path, monkeypatch):
-    """One after another with the same names, in an empty folder."""
+    """One after another with the same names, in an empty folder; over few cases, as they run without optimisation."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     names = {"__name__": "__main__"}
@@ -58,7 +59,7 @@ def test_python_blocks_run(page, tmp_path, monkeypatch):
         if kind == "file":
             Path(rest).write_text(block.code)
         with contextlib.redirect_stdout(io.StringIO()):
-            exec(compile(block.code, f"{page.name}, block {number}", "exec"), names)
+            exec(compile(CASES.sub("cases=10", block.code), f"{page.name}, block {number}", "exec"), names)
 
 
 @functools.cache
