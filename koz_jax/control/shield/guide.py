@@ -108,6 +108,9 @@ def torques(
     sideways = jnp.where(rotations.dot(soon_B, side_B) >= 0.0, guide.rate, -guide.rate)
     missing = jnp.clip((2.0 * guide.margin - margins) / (AHEAD * guide.seconds), 0.0, guide.rate)
     away_rate_B = jnp.sum(missing[:, None] * away_B, axis=0)
+    # What leads away from other zones does not take from what leads away from the nearest.
+    taken = jnp.maximum(missing[nearest] - rotations.dot(away_rate_B, away_B[nearest]), 0.0)
+    away_rate_B += taken * away_B[nearest]
     around_B = sideways * side_B + guide.tilt * guide.rate * away_B[nearest]
     gyroscopic_B = dynamics.gyroscopic_torque(body.omega_BN_B, model.inertia_B)
 

@@ -351,7 +351,7 @@ static float guide(
     float to_body[4], axis_B[3], look_N[3], out_B[3], nearest_B[3] = {0.0f, 0.0f, 0.0f}, side_B[3], rate_B[3];
     float momentum_B[3], gyroscopic_B[3], pushed_B[3], soon_B[3], missing_B[3] = {0.0f, 0.0f, 0.0f};
 @WHEELS@    float limit_B[3];
-    float margin, size, missing, sideways, nearest = unbounded;
+    float margin, size, missing, taken, sideways, nearest = unbounded, nearest_missing = 0.0f;
 @SEVERAL@    const float *look_B = koz_boresight_B[0]; /* that of the nearest zone */
     int zone, i;
     koz_conjugate(body->q_BN, to_body);
@@ -371,8 +371,12 @@ static float guide(
             if (margin < nearest) nearest_B[i] = out_B[i];
         }
 @SEVERAL@        if (margin < nearest) look_B = koz_boresight_B@OF_ZONE@;
+        if (margin < nearest) nearest_missing = missing;
         nearest = smaller(nearest, margin);
     }
+    /* What leads away from other zones does not take from what leads away from the nearest. */
+    taken = larger(0.0f, nearest_missing - koz_dot(missing_B, nearest_B));
+    for (i = 0; i < 3; i++) missing_B[i] += taken * nearest_B[i];
 @ONE@    koz_cross(nearest_B, koz_boresight_B, side_B);
 @SEVERAL@    koz_cross(nearest_B, look_B, side_B);
     multiply(inertia, body->omega_BN_B, momentum_B);
