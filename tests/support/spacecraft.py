@@ -1,6 +1,7 @@
 """Spacecraft and situations at random, for the tests of policies for any spacecraft."""
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import jax
@@ -20,10 +21,11 @@ SCALED = NetworkConfig.model_validate(
 )
 
 
+@functools.cache
 def agent(network: NetworkConfig = SCALED) -> Agent:
     """An untrained agent for any spacecraft, whose actions fill their range."""
     timid = tiny.untrained_agent(network=network)
-    policy = jax.tree.map(lambda leaf: 2.0 * leaf, timid.controller.policy)
+    policy = jax.tree.map(lambda leaf: 2.0 * np.asarray(leaf), timid.controller.policy)
     return dataclasses.replace(timid, controller=timid.controller.replace(policy=policy))
 
 
