@@ -1,7 +1,6 @@
 """Spacecraft and situations at random, for the tests of policies for any spacecraft."""
 
 import dataclasses
-import functools
 from typing import NamedTuple
 
 import jax
@@ -21,7 +20,6 @@ SCALED = NetworkConfig.model_validate(
 )
 
 
-@functools.cache
 def agent(network: NetworkConfig = SCALED) -> Agent:
     """An untrained agent for any spacecraft, whose actions fill their range."""
     timid = tiny.untrained_agent(network=network)

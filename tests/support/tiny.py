@@ -201,11 +201,15 @@ def contents(folder: Path) -> dict[Path, bytes | None]:
     return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
 
 
-@functools.cache  # many modules of tests begin with one, in every worker
+@functools.partial(jax.jit, static_argnums=0)  # once for all modules of tests that begin with an agent
+def _initial_policy(network: NetworkConfig, key: jax.Array) -> Any:
+    observed = jnp.zeros(observation_layout.size(network.observed_zones, network.scaled))
+    return policy_network(network).init(key, observed)
+
+
 def untrained_agent(seed: int = 0, network: NetworkConfig = CONFIG.network) -> Agent:
     """An agent with random weights, for the task of ``CONFIG``; gains of dials, which begin as zero, are random too."""
-    observed = jnp.zeros(observation_layout.size(network.observed_zones, network.scaled))
-    policy = jax.jit(policy_network(network).init)(jax.random.key(seed), observed)
+    policy = _initial_policy(network, jax.random.key(seed))
     gains = np.random.default_rng(seed)
     policy = jax.tree_util.tree_map_with_path(
         lambda path, leaf: jnp.float32(gains.normal(0.0, 0.5, leaf.shape)) if "Gain" in str(path) else leaf, policy
