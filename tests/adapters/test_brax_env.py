@@ -49,6 +49,7 @@ def test_rewards_and_observations_are_those_of_the_core():
     assert jnp.shape(state.obs) == (ENV.observation_size,)
 
 
+@pytest.mark.slow
 def test_typed_and_raw_keys_draw_the_same_scenario():
     key = jax.random.key(5)
     np.testing.assert_array_equal(ENV.reset(key).obs, ENV.reset(jax.random.key_data(key)).obs)

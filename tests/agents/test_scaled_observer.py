@@ -62,6 +62,7 @@ def test_it_sees_the_nearest_zones_and_absent_ones_as_the_core_does(present, obs
         np.testing.assert_allclose(seen, np.asarray(expected), rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_of_several_instruments_the_axes_are_those_of_the_nearest_zones():
     rng = np.random.default_rng(4)
     action = jnp.array([0.3, -0.2, 0.1])

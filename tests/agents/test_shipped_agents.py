@@ -106,6 +106,7 @@ def test_the_agent_for_any_spacecraft_keeps_a_rate_limit():
     assert np.linalg.norm(free.state.body.omega_BN_B, axis=1).max() > np.deg2rad(6.0)
 
 
+@pytest.mark.slow
 def test_an_urgency_is_refused_where_nobody_listens_and_where_it_is_none():
     with pytest.raises(SettingsError, match="urgency: phase2 was trained for one trade of time against effort; got"):
         load_agent("phase2").with_urgency(0.5)

@@ -153,6 +153,7 @@ def test_help_describes_every_flag(capsys, monkeypatch):
         assert re.sub(r"[\s|]", "", field.description) in text, name
 
 
+@pytest.mark.slow
 def test_table_json_and_csv_tell_the_same(capsys, run, empty_cwd):
     argv = ["--agent", run.path, "--cases", tiny.CASES, "--seed", 5, "--json", "x.json", "--csv", "x.csv"]
     assert tiny.status("evaluate", *argv) == 0
@@ -235,6 +236,7 @@ def test_the_command_itself(run, empty_cwd):
     assert list(json.loads((empty_cwd / "x.json").read_text())) == JSON_KEYS
 
 
+@pytest.mark.slow
 def test_an_agent_flies_ones_own_spacecraft_from_the_command_line(capsys, agent, empty_cwd):
     """What is given changes the agent's own task and nothing else, and it is told that it was not made for that."""
     own = ["--task.spacecraft.inertia", *"12 0 0 0 10 0 0 0 8".split(), "--task.spacecraft.torque-limit=0.4"]
@@ -305,6 +307,7 @@ def test_an_agent_that_is_named_is_flown_and_where_none_is_the_one_that_is_for_i
     assert parsing.parse(EvaluateFlags, argv.split(), "koz evaluate").name == name
 
 
+@pytest.mark.slow
 def test_a_named_agent_of_one_spacecraft_is_flown_on_another_and_does_not_hurry(capsys):
     """In place of another agent that can."""
     cubesat = tiny.MANEUVER_FILES["cubesat_6u"]

@@ -33,6 +33,7 @@ def test_slope_is_that_of_the_potential():
     assert checked > 32
 
 
+@pytest.mark.slow
 def test_room_in_a_mandatory_zone_is_that_of_the_paper():
     """(r . n - cos(theta_M)) / 2, though the zone is kept as one to stay out of."""
     look_B, axis_N, upright = jnp.array([0.0, 0.6, 0.8]), jnp.array([0.6, 0.0, 0.8]), jnp.eye(4)[0]

@@ -175,6 +175,7 @@ def test_a_cone_that_turns_faster_than_it_is_told_is_not_covered():
     assert fast and not slow
 
 
+@pytest.mark.slow
 def test_what_is_not_finite_is_not_covered_and_gets_no_torque():
     env, at = under(UncertaintyConfig()), ENV.reset(AT_REST)
     applied = jax.jit(lambda at, action: env.filter(at, action).applied)
@@ -193,6 +194,7 @@ def test_what_is_not_finite_is_not_covered_and_gets_no_torque():
     assert not env.covers(unknown)
 
 
+@pytest.mark.slow
 def test_a_craft_whose_wheels_are_full_is_covered_only_where_nothing_disturbs():
     wheels = [
         WheelConfig(axis=axis, max_torque=2.0, max_momentum=10.0).model_dump()

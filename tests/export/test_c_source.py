@@ -122,6 +122,7 @@ int main()
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="there is no C++ compiler")
 def test_a_user_in_cpp(folder, tmp_path):
     (tmp_path / "user.cpp").write_text(USER)

@@ -35,6 +35,7 @@ def test_a_shield_for_slower_cones_than_those_of_the_file_is_refused(tmp_path, c
     assert told.endswith("got 0.01; by default it is that\n") and not (tmp_path / "c").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 def test_c_is_told_of_all_constraints_and_each_may_have_any_place(tmp_path, monkeypatch):
     """Also where the policy sees one: that is the nearest, and the shield keeps all."""

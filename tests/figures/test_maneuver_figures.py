@@ -100,6 +100,7 @@ def test_torques_of_a_cubesat_are_in_millinewtons():
     np.testing.assert_allclose(np.array(line.get_ydata()), 1e3 * history.torque_B[:, 0], rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("maneuver", [lambda: flown("phase1"), lambda: flown("phase2"), flown_cubesat])
 def test_no_numbers_of_an_axis_touch(maneuver):
     assert crowded_labels(histories.draw(*maneuver())) == []

@@ -107,6 +107,7 @@ def test_ten_thousand_cases_make_small_figures(tmp_path):
         assert 5_000 < path.stat().st_size <= SCATTER_LIMIT
 
 
+@pytest.mark.slow
 def test_one_case_can_be_drawn():
     lost = outcomes(1).replace(settled=np.array([False]), settling_time=np.array([np.nan]))
     shown = monte_carlo.points(lost, TaskConfig())

@@ -151,6 +151,7 @@ def test_the_body_moves_as_one_without_wheels_but_for_the_square_of_the_step(whe
     assert coarse < 1e-3 and coarse / fine > 3.0
 
 
+@pytest.mark.slow
 @every_set
 def test_up_to_the_largest_rate_half_of_the_torque_is_left_and_no_wheel_is_full(wheels):
     """At any attitude: the total momentum is fixed, and any part of it may be the wheels' to hold."""

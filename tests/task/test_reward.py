@@ -41,6 +41,7 @@ def _terms_of(params: RewardParams, **measured: float | np.floating) -> dict[str
     return {name: float(getattr(found, name)) for name in NAMES}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("convention", "factor"), [("full", 1.0), ("half", 0.5)])
 def test_every_term_agrees_with_the_oracle(convention, factor, request):
     params = request.getfixturevalue(convention)

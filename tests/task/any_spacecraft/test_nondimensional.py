@@ -49,6 +49,7 @@ def test_the_observation_has_the_entries_that_are_declared():
     assert bool(jnp.all(jnp.isfinite(seen)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scale", "torque_scale"), [(1e-3, 1e-4), (1e3, 5.0)])
 def test_spacecraft_of_one_shape_look_alike_and_ask_for_the_same_share(scale, torque_scale):
     small, large = spacecraft(), spacecraft(scale, torque_scale)
