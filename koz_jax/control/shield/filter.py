@@ -72,7 +72,7 @@ class Shield(struct.PyTreeNode):
         if limit is None:
             return safe
         # A rate of twice that of the approach, whose largest in free motion is at most sqrt(2) times as large.
-        holds = (limit.squared >= 8.0 * self.brake.approach**2) & ((limit.squared > 0.0) | (self.brake.approach == 0.0))
+        holds = limit.squared >= 8.0 * self.brake.approach**2
         return safe & holds & (limit.squared_peak(at.body) <= limit.squared)
 
     def allow(self, measured: EnvState, action: jax.Array, model: Model) -> Allowed:

@@ -341,6 +341,13 @@ static void brake(const body_state *body, float torque_B[3])
     for (i = 0; i < 3; i++) torque_B[i] /= largest;
 }
 
+/* Rate [rad/s] that leads away from a zone at this margin [rad]. */
+static float rate_away(float margin)
+{
+    const float missing = (2.0f * guide_margin - margin) / (guide_ahead * guide_seconds);
+    return larger(0.0f, smaller(guide_rate, missing));
+}
+
 /*
  * Torques that lead the boresight around the nearest zone and away from all near ones, and only away.  Returns the
  * margin [rad] to the nearest.
@@ -351,7 +358,7 @@ static float guide(
     float to_body[4], axis_B[3], look_N[3], out_B[3], nearest_B[3] = {0.0f, 0.0f, 0.0f}, side_B[3], rate_B[3];
     float momentum_B[3], gyroscopic_B[3], pushed_B[3], soon_B[3], missing_B[3] = {0.0f, 0.0f, 0.0f};
 @WHEELS@    float limit_B[3];
-    float margin, size, missing, taken, sideways, nearest = unbounded, nearest_missing = 0.0f;
+    float margin, size, missing, taken, sideways, nearest = unbounded;
 @SEVERAL@    const float *look_B = koz_boresight_B[0]; /* that of the nearest zone */
     int zone, i;
     koz_conjugate(body->q_BN, to_body);
@@ -363,19 +370,17 @@ static float guide(
         koz_rotate(to_body, now->zone_axis_N[zone], axis_B);
         koz_cross(axis_B, koz_boresight_B@OF_ZONE@, out_B);
         size = koz_norm(out_B);
-        missing = (2.0f * guide_margin - margin) / (guide_ahead * guide_seconds);
-        missing = larger(0.0f, smaller(guide_rate, missing));
+        missing = rate_away(margin);
         for (i = 0; i < 3; i++) {
             out_B[i] = size > 0.0f ? out_B[i] / size : 0.0f;
             missing_B[i] += missing * out_B[i];
             if (margin < nearest) nearest_B[i] = out_B[i];
         }
 @SEVERAL@        if (margin < nearest) look_B = koz_boresight_B@OF_ZONE@;
-        if (margin < nearest) nearest_missing = missing;
         nearest = smaller(nearest, margin);
     }
     /* What leads away from other zones does not take from what leads away from the nearest. */
-    taken = larger(0.0f, nearest_missing - koz_dot(missing_B, nearest_B));
+    taken = larger(0.0f, rate_away(nearest) - koz_dot(missing_B, nearest_B));
     for (i = 0; i < 3; i++) missing_B[i] += taken * nearest_B[i];
 @ONE@    koz_cross(nearest_B, koz_boresight_B, side_B);
 @SEVERAL@    koz_cross(nearest_B, look_B, side_B);
@@ -416,7 +421,7 @@ int koz_is_safe(const koz_situation *now)
     const body_state body = body_of(&unit);
     if (2.0f * approach > guide_rate) return 0;
 @WHEELS@    if (!(squared_peak(body.omega_BN_B) <= squared_limit(&unit))) return 0;
-@WHEELS@    if (approach > 0.0f && !(squared_limit(&unit) >= 8.0f * approach * approach)) return 0;
+@WHEELS@    if (!(squared_limit(&unit) >= 8.0f * approach * approach)) return 0;
     return koz_fault(now) == NULL && clearance(&stated, &unit, &body, 0.0f, shield_margin) >= shield_margin;
 }
 
