@@ -12,7 +12,7 @@ import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
 from koz_jax import devices
-from koz_jax.agents import numpy_policy
+from koz_jax.agents import numpy_policy, older
 from koz_jax.agents.numpy_policy import NumpyPolicy
 from koz_jax.agents.record import Provenance, Record, find_agent, read_agent_record
 from koz_jax.agents.sb3 import is_sb3, read_sb3
@@ -112,7 +112,7 @@ def load_agent(
             (observation_layout.size(record.network.observed_zones, record.network.scaled),), np.float32
         ),
     )
-    policy = archive.load_tree(folder, template)
+    policy = archive.load_tree(folder, template, functools.partial(older.as_today, network=record.network))
     # What was spread in training is not what is flown unless somebody asks for it.
     task = record.task.model_copy(update={"spread": SpreadConfig()})
     return Agent(PolicyController(policy, record.network), task, record.provenance, str(name))

@@ -210,6 +210,7 @@ class ScaledObserver(Observer):
             "q_e": [q_e[0], *(axes @ q_e[1:])],
             "omega_BN_P": self._seen.time * (axes @ omega_BN_B),
             **self._seen.seen,
+            **constants.seen_times(self._seen, omega_BN_B, q_e, self._share()),
             "urgency": [2.0 * self._urgency - 1.0],
         }
         if self._wheels:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from koz_jax.agents import older
 from koz_jax.agents.record import Record, find_agent, read_agent_record
 from koz_jax.config.task import ScenarioConfig
 from koz_jax.config.training import NetworkConfig
@@ -75,7 +76,7 @@ def load_policy(name: str | Path = "phase2") -> NumpyPolicy:
     folder = find_agent(name)
     record = read_agent_record(folder)
     try:
-        return from_arrays(archive.read_arrays(folder), record, str(name))
+        return from_arrays(older.as_today(archive.read_arrays(folder), record.network), record, str(name))
     except DamagedFileError as error:
         raise DamagedFileError(f"{folder}: {error}") from None
 

@@ -47,6 +47,9 @@ class Scaling(Settings):
     seen: dict[str, tuple[float, ...]]
     """Parts of the observation that are the same all the time; but reach and rate_limit of a spacecraft with wheels,
     which are those of the start, at rest."""
+    times_per_rate: tuple[Vector, Vector, Vector]
+    """[s^2] The inertia over the torque limit of each axis: takes a rate [rad/s] in body axes to the times [s] in which
+    the limits stop it, for stopping and turning; of a spacecraft with wheels, the limits at rest."""
     torque_per_action: tuple[Vector, Vector, Vector]
     """[N m] Takes an action to a torque in body axes."""
     urgency: float
@@ -170,6 +173,7 @@ def _scaling(task: TaskConfig, urgency: float, boresight: Vector) -> Scaling:
             "torque_unit": own.torque,
             "axes": own.axes.tolist(),
             "seen": {name: own.seen[name].tolist() for name in layout(scaled=True) if name in own.seen},
+            "times_per_rate": own.times_per_rate.tolist(),
             "torque_per_action": own.torque_per_action.tolist(),
             "urgency": urgency,
         }
@@ -224,6 +228,7 @@ def _scaling_text(scaling: Scaling) -> list[str]:
         f"Units of this spacecraft: T = sqrt(J / u) = {scaling.time_unit:.6g} s, J = {scaling.inertia_unit:.6g} kg m^2,"
         f" u = {scaling.torque_unit:.6g} N m. The policy's axes have x along the boresight; their rows in body"
         f" components: {_matrix(scaling.axes)}. torque_per_action: {_matrix(scaling.torque_per_action)} N m."
+        f" times_per_rate, the inertia over the torque limits: {_matrix(scaling.times_per_rate)} s^2."
         f" Constant parts of the observation: {_seen(scaling)}. Urgency u01 in [0, 1] is seen as 2 u01 - 1.",
     ]
 

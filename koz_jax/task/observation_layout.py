@@ -37,6 +37,8 @@ _SPACECRAFT = {
     "reach": 3,  # [u] largest torque along each axis
     "step": 1,  # log of the time step [T] over ``SHORTEST_STEP``
     "rate_limit": 1,  # log of the largest rate [1/T] over ``FREE_RATE``
+    "stopping": 2,  # time t in which the torque stops the rate [T], and t^2 / 2 [T^2]
+    "turning": 1,  # t^2 / 2 of the time in which it turns the attitude error from rest [T^2]
     "urgency": 1,  # from -1 (thrifty) to 1 (fast)
 }
 
@@ -48,6 +50,9 @@ FREE_RATE = 3.0
 
 # Of that rate, what a policy tells apart from no rate at all.
 LEAST_RATE = 1e-3
+
+# [T] What takes the torque longer is not told apart.
+LONGEST_TIME = 5.0
 
 # [u / J] An action of one of a policy for any spacecraft asks for this acceleration; the torque box then limits it.
 FULL_ACTION = 2.0
@@ -68,6 +73,11 @@ _MEANING = {
     "reach": "[u] largest torque along each of the policy's axes",
     "step": f"natural logarithm of the time step over {SHORTEST_STEP} T, at least 0",
     "rate_limit": f"natural logarithm of the largest rate over {FREE_RATE} / T, at most 0: there is no limit",
+    "stopping": "time t [T] in which the torque stops the rate: momentum over torque limit, of the body axis where that"
+    f" is largest, at most {LONGEST_TIME:g}; and t^2 / 2",
+    "turning": "t^2 / 2 of the time t [T] in which the torque turns a body at rest by the attitude error: inertia times"
+    " twice the vector part of q_e over torque limit, of the body axis where that is largest, at most"
+    f" {LONGEST_TIME**2 / 2:g}; where that of stopping is as much, it is time to brake",
     "urgency": "from -1 (thrifty) to 1 (as fast as the torque allows)",
 }
 

@@ -10,6 +10,7 @@ import pytest
 from support import oracle, spacecraft, tiny
 
 import koz_jax
+from koz_jax.agents.agent import load_agent
 from koz_jax.agents.numpy_observer import Observer, ScaledObserver, observer_of, scaled_observer_of
 from koz_jax.agents.numpy_policy import load_policy
 from koz_jax.config.task import SpacecraftConfig
@@ -148,10 +149,27 @@ def test_what_is_out_of_range_is_refused_by_name(urgency):
         observer.torque([0.0, 0.0, np.nan])
 
 
+def test_an_agent_of_before_stopping_and_turning_were_seen_decides_as_it_did(tmp_path):
+    AGENT.save(tmp_path / "agent")
+    arrays, record = archive.read_arrays(tmp_path / "agent"), archive.read_record(tmp_path / "agent")
+    where, name = slices(1, scaled=True), "params/Mlp_0/Dense_0/kernel"
+    first, last = where["stopping"].start, where["turning"].stop
+    old = np.delete(arrays[name], np.s_[first:last], axis=0)
+    kept = {part: value for part, value in record.items() if "sha256" not in part and part != "format"}
+    archive.save_tree(tmp_path / "old", arrays | {name: old}, kept)
+    unseen = arrays[name].copy()
+    unseen[first:last] = 0.0
+    archive.save_tree(tmp_path / "unseen", arrays | {name: unseen}, kept)
+    observed = np.random.default_rng(0).normal(size=(20, size(1, scaled=True))).astype(np.float32)
+    for load in (load_policy, load_agent):
+        expected = load(tmp_path / "unseen").predict(observed)
+        np.testing.assert_array_equal(load(tmp_path / "old").predict(observed), expected)
+
+
 def test_a_missing_or_foreign_gain_is_refused(tmp_path):
     AGENT.save(tmp_path / "agent")
     policy = load_policy(tmp_path / "agent")
-    observed = np.random.default_rng(0).normal(size=(100, 24)).astype(np.float32)
+    observed = np.random.default_rng(0).normal(size=(100, size(1, scaled=True))).astype(np.float32)
     np.testing.assert_allclose(policy.predict(observed), AGENT.predict(observed), rtol=0, atol=2e-6)
     arrays = archive.read_arrays(tmp_path / "agent")
     name = "params/Mlp_0/Gain_1/kernel"

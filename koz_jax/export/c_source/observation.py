@@ -12,7 +12,7 @@ import numpy as np
 from koz_jax.export.c_source import literals
 from koz_jax.export.golden import Golden
 from koz_jax.export.metadata import Metadata, Scaling
-from koz_jax.task.observation_layout import FREE_RATE, LEAST_RATE, slices
+from koz_jax.task.observation_layout import FREE_RATE, LEAST_RATE, LONGEST_TIME, slices
 
 _OF_ONE = {
     "URGENCY_DEFINITION": "",
@@ -57,12 +57,24 @@ _OF_ANY = {
     "SPACECRAFT": """static const float policy_axes@OF_INSTRUMENTS@[3][3] = {@AXES@}; /* rows in body components */
 static const float rate_to_policy@OF_INSTRUMENTS@[3][3] = {@RATE_TO_POLICY@}; /* [s] the same times T */
 static const float constant_parts@OF_INSTRUMENTS@[@SEEN_COUNT@] = {@SEEN@}; /* @SEEN_NAMES@ */
+static const float times_per_rate[3][3] = {@TIMES_PER_RATE@}; /* [s T] inertia over torque limits */
 static const float torque_per_action@OF_INSTRUMENTS@[3][3] = {@TORQUE_PER_ACTION@}; /* [N m] */
 
 static void multiply(const float m[3][3], const float v[3], float product[3])
 {
     int i;
     for (i = 0; i < 3; i++) product[i] = koz_dot(m[i], v);
+}
+
+/* Time [T] for which the torque limits push, until the momentum of a rate [rad/s] is there or gone. */
+static float time_of_torque(const float change_B[3])
+{
+    float time_B[3], longest = 0.0f;
+    int i;
+    multiply(times_per_rate, change_B, time_B);
+    for (i = 0; i < 3; i++)
+        if (fabsf(time_B[i]) > longest) longest = fabsf(time_B[i]);
+    return longest;
 }
 
 static float usable(float urgency)
@@ -79,7 +91,8 @@ static float usable(float urgency)
 @WHEELS@}
 @WHEELS@
 """,
-    "OBSERVE_BODY": """    float direction_B[3];
+    "OBSERVE_BODY": """    float direction_B[3], twice_B[3];
+    float *times = observation + KOZ_OBSERVATION_SIZE - 4;
 @WHEELS@    const float share = koz_wheels_share(&unit);
     remember(memory, &unit);
 """,
@@ -94,9 +107,17 @@ static float usable(float urgency)
     multiply(policy_axes@OF_MEMORY@, memory->q_e + 1, observation + 1);
     multiply(rate_to_policy@OF_MEMORY@, unit.omega_BN_B, observation + 4);
     for (i = 0; i < @SEEN_COUNT@; i++) observation[4 + 8 * KOZ_OBSERVED_ZONES + i] = constant_parts@OF_MEMORY@[i];
+    for (i = 0; i < 3; i++) twice_B[i] = 2.0f * memory->q_e[1 + i] / @TIME_UNIT@;
+    times[0] = time_of_torque(unit.omega_BN_B);
+    times[2] = time_of_torque(twice_B);
 @WHEELS@    koz_wheels_limits(&unit, memory->torque_limit);
+@WHEELS@    times[0] /= share;
+@WHEELS@    times[2] /= share;
 @WHEELS@    for (i = 0; i < 3; i++) observation[@REACH@ + i] *= share;
 @WHEELS@    observation[@RATE_LIMIT@] = seen_rate(koz_wheels_largest_rate(&unit));
+    if (times[0] > @LONGEST@) times[0] = @LONGEST@;
+    times[1] = 0.5f * times[0] * times[0];
+    if (times[2] > @LONGEST_HALF_SQUARE@) times[2] = @LONGEST_HALF_SQUARE@;
     observation[KOZ_OBSERVATION_SIZE - 1] = 2.0f * usable(memory->urgency) - 1.0f;
 """,
     "TORQUE": """    float action[KOZ_ACTION_SIZE];
@@ -166,6 +187,10 @@ def _constants(scalings: Sequence[Scaling], zones: int) -> dict[str, str]:
         "RATE_LIMIT": str(where["rate_limit"].start),
         "FREE_RATE": literals.number(FREE_RATE / own.time_unit),
         "LEAST_RATE": literals.number(LEAST_RATE),
+        "TIMES_PER_RATE": literals.matrix(np.array(own.times_per_rate) / own.time_unit),
+        "LONGEST": literals.number(LONGEST_TIME),
+        "LONGEST_HALF_SQUARE": literals.number(LONGEST_TIME**2 / 2),
+        "TIME_UNIT": literals.number(own.time_unit),
         "TORQUE_PER_ACTION": each(lambda scaling: literals.matrix(scaling.torque_per_action)),
     }
 

@@ -13,7 +13,7 @@ from koz_jax.config.task import SpacecraftConfig
 from koz_jax.errors import SettingsError
 from koz_jax.task import host
 from koz_jax.task.host import Floats
-from koz_jax.task.observation_layout import FREE_RATE, FULL_ACTION, LEAST_RATE, SHORTEST_STEP
+from koz_jax.task.observation_layout import FREE_RATE, FULL_ACTION, LEAST_RATE, LONGEST_TIME, SHORTEST_STEP
 
 
 class Constants(NamedTuple):
@@ -25,6 +25,7 @@ class Constants(NamedTuple):
     axes: Floats  # (3, 3) rows: the policy's axes in body components, x along the instrument
     seen: dict[str, Floats]  # parts of the observation that are of the spacecraft, by their names in the layout; of one
     # with wheels, reach and rate limit are those of the start, at rest
+    times_per_rate: Floats  # (3, 3) [s^2] takes a rate in body axes to the times [s] in which the torque limits stop it
     torque_per_action: Floats  # (3, 3) [N m] takes an action to a torque in body axes
     torque_limits: Floats  # (3,) [N m] at which each component of that torque is clipped; of wheels, those at rest
 
@@ -51,7 +52,19 @@ def of(spacecraft: SpacecraftConfig, step_seconds: float, boresight: npt.ArrayLi
         "step": np.log([max(step_seconds / (time * SHORTEST_STEP), 1.0)]),
         "rate_limit": seen_rate(rate_at_start(spacecraft), time),
     }
-    return Constants(time, inertia, torque, axes, seen, FULL_ACTION * torque / inertia * inertia_B @ axes.T, limits)
+    per_action = FULL_ACTION * torque / inertia * inertia_B @ axes.T
+    return Constants(time, inertia, torque, axes, seen, inertia_B / limits[:, None], per_action, limits)
+
+
+def seen_times(own: Constants, omega_BN_B: Floats, q_e: Floats, share: float = 1.0) -> dict[str, Floats]:
+    """Parts of the observation that say how long the torque takes.
+
+    omega_BN_B: (3,) [rad/s]; q_e: (4,) attitude error in body axes; share: of the torque limits, what is left.
+    """
+    stopping, turning = (np.max(np.abs(own.times_per_rate @ change)) / share for change in (omega_BN_B, 2.0 * q_e[1:]))
+    stopping = min(stopping / own.time, LONGEST_TIME)
+    turning = min(turning / own.time**2, LONGEST_TIME**2 / 2)
+    return {"stopping": np.array([stopping, stopping**2 / 2]), "turning": np.array([turning])}
 
 
 def seen_rate(largest: float, time: float) -> Floats:

@@ -1,8 +1,9 @@
 """What a policy for any spacecraft sees and commands: all in units of the spacecraft, in axes of the instrument.
 
 The observation holds the attitude error, the rate and the nearest zones as the paper's does, but in the units and axes
-of ``units``, and then what tells spacecraft apart: shape of the inertia, torque, time step, rate limit; and the
-urgency.  The action is an angular acceleration, so that slender bodies are turned about each axis with the same gain.
+of ``units``, then what tells spacecraft apart: shape of the inertia, torque, time step, rate limit; what that means for
+this motion: how long the torque takes to stop the rate, and to turn by the attitude error; and the urgency.  The action
+is an angular acceleration, so that slender bodies are turned about each axis with the same gain.
 """
 
 import jax
@@ -11,7 +12,15 @@ import jax.numpy as jnp
 from koz_jax.task import dynamics, observation, pointing_constraints, rotations
 from koz_jax.task.any_spacecraft import units
 from koz_jax.task.any_spacecraft.units import Units
-from koz_jax.task.observation_layout import FREE_RATE, FULL_ACTION, LEAST_RATE, SHORTEST_STEP, layout, zone_part
+from koz_jax.task.observation_layout import (
+    FREE_RATE,
+    FULL_ACTION,
+    LEAST_RATE,
+    LONGEST_TIME,
+    SHORTEST_STEP,
+    layout,
+    zone_part,
+)
 from koz_jax.task.pointing_constraints import PointingConstraint
 from koz_jax.task.state import EnvState, Model, attitude_error, largest_rate, torque_limits
 
@@ -26,13 +35,18 @@ def observe(state: EnvState, model: Model, urgency: jax.Array | float, zones: in
     axes = units.policy_axes(nearest.boresight_B[0])
     own = units.of(model)
     q_e = attitude_error(state)
+    box_B = torque_limits(state, model).box_B
+    stopping = jnp.minimum(units.time_of_torque(state.body.omega_BN_B, box_B, model) / own.time, LONGEST_TIME)
+    turning = jnp.minimum(units.time_of_torque(2.0 * q_e[1:], box_B, model) / own.time**2, LONGEST_TIME**2 / 2)
     parts = {
         "q_e": jnp.concatenate([q_e[:1], dynamics.matvec(axes, q_e[1:])]),
         "omega_BN_P": own.time * dynamics.matvec(axes, state.body.omega_BN_B),
         "inertia": _entries(axes @ model.inertia_B @ axes.T) / own.inertia,
-        "reach": _reach(axes, torque_limits(state, model).box_B) / own.torque,
+        "reach": _reach(axes, box_B) / own.torque,
         "step": jnp.log(jnp.maximum(model.dt / (own.time * SHORTEST_STEP), 1.0))[None],
         "rate_limit": _rate_limit(largest_rate(state, model), own)[None],
+        "stopping": jnp.stack([stopping, 0.5 * stopping**2]),
+        "turning": turning[None],
         "urgency": jnp.full(1, 2.0 * urgency - 1.0),
     }
     for name, values in jax.vmap(_zone_parts, in_axes=(None, 0, None))(state.body.q_BN, nearest, axes).items():

@@ -11,7 +11,7 @@ from koz_jax.task import dynamics, pointing_constraints, rotations, state
 from koz_jax.task.any_spacecraft import nondimensional, units
 from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.environment import model_from_config
-from koz_jax.task.observation_layout import FREE_RATE, SHORTEST_STEP, layout, size, slices
+from koz_jax.task.observation_layout import FREE_RATE, LONGEST_TIME, SHORTEST_STEP, layout, size, slices
 from koz_jax.task.pointing_constraints import PointingConstraint
 from koz_jax.task.scenario import Scenario
 from koz_jax.task.state import EnvState, Model
@@ -79,12 +79,36 @@ def test_a_turn_of_the_bodys_axes_that_keeps_the_policys_changes_nothing():
         ),
     )
     seen = nondimensional.observe(own, model, 0.5), nondimensional.observe(turned, turned_model, 0.5)
-    same = [name for name in WHERE if name != "reach"]  # ... which the turn does not keep
+    same = [name for name in WHERE if name not in {"reach", "stopping", "turning"}]  # ... which the turn does not keep
     for name in same:
         np.testing.assert_allclose(seen[0][WHERE[name]], seen[1][WHERE[name]], atol=2e-6, err_msg=name)
     action = jnp.array([0.2, -0.1, 0.3])
     first = dynamics.matvec(axes, nondimensional.command(action, own, model))
     np.testing.assert_allclose(first, nondimensional.command(action, turned, turned_model), atol=1e-6)
+
+
+def test_it_is_time_to_brake_where_stopping_takes_as_long_as_turning():
+    """About a principal axis, the full torque stops a rate w over the angle w^2 J / (2 u)."""
+    body = SpacecraftConfig(inertia=((3.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.0, 4.0)), torque_limit=(0.5, 1.0, 0.8))
+    model = model_from_config(TaskConfig(spacecraft=body))
+    own, angle = units.of(model), 0.02
+    for axis, (moment, limit) in enumerate(zip((3.0, 2.0, 4.0), body.torque_limits, strict=True)):
+        along = jnp.eye(3)[axis]
+        at = maneuver(model)
+        start = rotations.multiply(at.scenario.q_DN, jnp.concatenate([jnp.ones(1), 0.5 * angle * along]))
+        rate = np.sqrt(2.0 * angle * limit / moment)
+        turning = at.replace(body=RigidBodyState(rotations.normalize(start), -rate * along))
+        seen = nondimensional.observe(turning, model, 0.5)
+        time, half_square = np.asarray(seen[WHERE["stopping"]])
+        assert time == pytest.approx(moment * rate / limit / float(own.time), rel=1e-5)
+        assert half_square == pytest.approx(0.5 * time**2, rel=1e-6)
+        assert float(seen[WHERE["turning"]][0]) == pytest.approx(half_square, rel=1e-3)
+
+
+def test_the_time_to_stop_is_bounded():
+    model = spacecraft()
+    seen = nondimensional.observe(maneuver(model, rate=1e3), model, 0.5)
+    np.testing.assert_array_equal(seen[WHERE["stopping"]], [LONGEST_TIME, LONGEST_TIME**2 / 2])
 
 
 def test_an_action_is_an_angular_acceleration_along_the_policys_axes():
