@@ -142,6 +142,7 @@ def init(config: TrainConfig, key: jax.Array) -> TrainState:
     states = jax.vmap(env.reset)(jax.random.split(key_envs, config.num_envs))
     head_start = _head_starts(config)
 
+    @jax.jit
     def random_step(states: EnvState, number: jax.Array, key_step: jax.Array) -> tuple[EnvState, Transition]:
         key_action, key_reset = jax.random.split(key_step)
         action = jax.random.uniform(key_action, (config.num_envs, ACTION_SIZE), minval=-1.0, maxval=1.0)
@@ -220,15 +221,16 @@ def train_step(config: TrainConfig, env: Reorientation, state: TrainState) -> tu
 @devices.in_float32
 def train_chunk(config: TrainConfig, state: TrainState, steps: jax.Array) -> tuple[TrainState, TrainMetrics]:
     """Run ``steps`` training steps (traced: chunks of any length share one compilation) and average their metrics."""
-    env = training_environment(config)
+    # A program within the program: traced once for its shapes and for the loop.
+    step = jax.jit(functools.partial(train_step, config, training_environment(config)))
 
     def body(_: jax.Array, carry: tuple[TrainState, TrainMetrics]) -> tuple[TrainState, TrainMetrics]:
         state, sums = carry
-        state, metrics = train_step(config, env, state)
+        state, metrics = step(state)
         first = jnp.where(sums.fault == finite_checks.NO_FAULT, metrics.fault, sums.fault)
         return state, jax.tree.map(jnp.add, sums, metrics).replace(fault=first)
 
-    shapes = jax.eval_shape(lambda s: train_step(config, env, s)[1], state)
+    shapes = jax.eval_shape(lambda s: step(s)[1], state)
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     zeros = zeros.replace(fault=jnp.int32(finite_checks.NO_FAULT))
     state, sums = jax.lax.fori_loop(0, steps, body, (state, zeros))

@@ -198,15 +198,15 @@ def _smoke() -> TrainConfig:
     """Everything that a training does, in seconds: to see whether it runs, not to learn."""
     short = _short()
     phase1, phase2 = (
-        phase.model_copy(update={"updates": 1_600}) for phase in (short.curriculum.phase1, short.curriculum.phase2)
+        phase.model_copy(update={"updates": 800}) for phase in (short.curriculum.phase1, short.curriculum.phase2)
     )
     return short.model_copy(
         update={
             "preset": "smoke",
             "curriculum": short.curriculum.model_copy(update={"phase1": phase1, "phase2": phase2}),
             "refine": short.refine.model_copy(update={"iterations": 10, "scenarios": 8}),
-            "eval_every": 800,
-            "log_every": 400,
+            "eval_every": 400,
+            "log_every": 200,
             "refine_eval_every": 10,
         }
     )
