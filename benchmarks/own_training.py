@@ -23,6 +23,7 @@ from koz_jax.config.presets.named import preset
 from koz_jax.config.presets.spacecraft import for_spacecraft
 from koz_jax.config.task import TaskConfig
 from koz_jax.evaluation.monte_carlo import monte_carlo
+from koz_jax.evaluation.summary import summarise
 from koz_jax.runs.folder import RunFolder
 from koz_jax.runs.trainer import train
 from koz_jax.storage import runtime
@@ -80,7 +81,7 @@ def own_agent(task: TaskConfig, folder: Path, chosen: str) -> Agent:
 
 def fly(agent: Agent, task: TaskConfig, cases: int) -> Flown:
     """Fly cases of a seed that nothing was trained on."""
-    summary = monte_carlo(agent, cases=cases, task=task, seed=1).summary
+    summary = summarise(monte_carlo(agent, cases=cases, task=task, seed=1).results)
     time, torque = task.spacecraft.time_unit, task.spacecraft.strength
     return Flown(
         summary.success_rate, summary.settling_time_mean / time, summary.control_effort_mean / (torque**2 * time)
