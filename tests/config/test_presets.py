@@ -184,6 +184,10 @@ def test_a_spacecraft_that_is_twice_as_slow_is_trained_over_the_same_steps(name)
     assert own.task.spacecraft.time_unit == pytest.approx(2.0 * given.task.spacecraft.time_unit)
     assert own.training_episode_steps == given.training_episode_steps
     assert own.refine_steps == given.refine_steps
+    # Gradients of a policy in units of its spacecraft are bounded; a preset that is for one bounds them itself.
+    assert own.refine.max_maneuver_gradient > 0.0 and own.refine.state_gradient is not None
+    same = own.refine.model_copy(update={"horizon_seconds": given.refine.horizon_seconds}) == given.refine
+    assert same == given.network.scaled
     assert own.task.episode_steps == round(given.task.episode_seconds / given.task.step_seconds)
     assert own.network.scaled and not own.task.spread.spacecraft
     limits = given.task.spread.max_rate_deg

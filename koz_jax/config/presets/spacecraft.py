@@ -26,6 +26,17 @@ def _spread(given: TaskConfig, task: TaskConfig) -> SpreadConfig:
     return spread.model_copy(update=changes)
 
 
+# How a policy in units and axes of its spacecraft is refined: that of Soft Actor-Critic chatters, so its gradients are
+# bounded over the steps and for each maneuver, and Adam's steps with so many constant inputs are too large for it.
+_REFINED = {
+    "optimizer": "muon",
+    "learning_rate": 2e-3,
+    "max_maneuver_gradient": 0.1,
+    "max_gradient_norm": 1.0,
+    "state_gradient": (30.0, 300.0),
+}
+
+
 def for_spacecraft(config: TrainConfig, task: TaskConfig) -> TrainConfig:
     """Settings that train for one spacecraft; its policy sees it in its own units and axes.
 
@@ -36,8 +47,9 @@ def for_spacecraft(config: TrainConfig, task: TaskConfig) -> TrainConfig:
     def stretched(seconds: float) -> float:
         return max(round(stretch * seconds / task.step_seconds), 1) * task.step_seconds
 
-    network = config.network
+    network, refined = config.network, {}
     if not network.scaled:
+        refined = _REFINED
         own = config.task.spacecraft.time_unit
         in_units = tuple(own * scale for scale in network.encoding.rate_scales)
         encoding = network.encoding.model_copy(update={"rate_scales": in_units})
@@ -46,6 +58,8 @@ def for_spacecraft(config: TrainConfig, task: TaskConfig) -> TrainConfig:
         "task": task.model_copy(update={"spread": _spread(config.task, task)}),
         "network": network,
         "training_episode_seconds": stretched(config.training_episode_seconds),
-        "refine": config.refine.model_copy(update={"horizon_seconds": stretched(config.refine.horizon_seconds)}),
+        "refine": config.refine.model_copy(
+            update={"horizon_seconds": stretched(config.refine.horizon_seconds), **refined}
+        ),
     }
     return TrainConfig.model_validate(config.model_copy(update=changes).model_dump())
