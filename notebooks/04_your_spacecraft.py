@@ -13,7 +13,8 @@ import numpy as np
 from IPython.display import display
 from pydantic import ValidationError
 
-from koz_jax import TaskConfig, TrainConfig, fly_case, load_agent, monte_carlo, preset, table, train
+from koz_jax import TaskConfig, fly_case, load_agent, monte_carlo, preset, table, train
+from koz_jax.config.presets.spacecraft import for_spacecraft
 from koz_jax.figures import sphere
 from koz_jax.storage import runtime
 
@@ -58,11 +59,11 @@ print(table(before, name="universal"))
 
 # %% [markdown]
 # ## One of its own
-# The settings of notebook 2, with the new task. Such an agent must be trained again for every change of the spacecraft.
+# The settings of notebook 2 in units of this spacecraft, as `koz train --spacecraft FILE` makes them. Such an agent must
+# be trained again for every change of the spacecraft.
 
 # %%
-short = preset("short")
-config = TrainConfig.model_validate(short.model_dump() | {"task": mine.model_dump()})
+config = for_spacecraft(preset("short"), mine)
 run = Path("runs", "my-spacecraft")
 train(config, run, progress=False)
 agent = load_agent(run)

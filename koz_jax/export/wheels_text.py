@@ -10,10 +10,10 @@ _LEFT = (
 )
 _SEEN = (
     "So reach and rate_limit in the observation are no constants, and given for the start, at rest. The same share is"
-    " in reach, and stopping and turning are of what is left; rate_limit is of the largest rate that they can stop, or of max_rate_deg where that is less: the least"
-    " over the wheels of (max_momentum - |h - P H|) / |row of P|, less L, over c, or 2 K /"
-    " (L + sqrt(L^2 + 2 (c - a) K)) where that is less, with L = |I w + H|, a and c the extreme moments of the inertia"
-    f" I, and K the smallest torque_limit times {1.0 - BRAKE_SHARE:g}"
+    " in reach, and stopping and turning are of what is left; rate_limit is of the largest rate that they can stop, or"
+    " of max_rate_deg where that is less: the least over the wheels of (max_momentum - |h - P H|) / |row of P|, less L,"
+    " over c, or 2 K / (L + sqrt(L^2 + 2 (c - a) K)) where that is less, with L = |I w + H|, a and c the extreme"
+    f" moments of the inertia I, and K the smallest torque_limit times {1.0 - BRAKE_SHARE:g}"
 )
 
 
