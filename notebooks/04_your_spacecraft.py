@@ -59,8 +59,8 @@ print(table(before, name="universal"))
 
 # %% [markdown]
 # ## One of its own
-# The settings of notebook 2 in units of this spacecraft, as `koz train --spacecraft FILE` makes them. Such an agent must
-# be trained again for every change of the spacecraft.
+# The settings of notebook 2 in units of this spacecraft, as `koz train --spacecraft FILE` makes them. Such an agent
+# must be trained again for every change of the spacecraft.
 
 # %%
 config = for_spacecraft(preset("short"), mine)
