@@ -132,22 +132,22 @@ def test_every_flipped_bit_and_truncation_is_noticed(saved):
 
 
 @pytest.mark.slow
-def test_every_flipped_bit_of_the_record_is_noticed_or_changes_nothing(tmp_path):
+def test_a_flipped_bit_of_any_byte_of_the_record_is_noticed_or_changes_nothing(tmp_path):
     record = {"note": "first", "scale": 1e-05, "sizes": (16, 16), "text": "a,b\n1,0.5\n"}
     archive.save_tree(tmp_path / "state", small(), record)
     path = tmp_path / "state" / "record.json"
     whole, content = path.read_bytes(), archive.read_record(tmp_path / "state")
     harmless = 0
     for position in range(len(whole)):
-        for bit in range(8):
-            path.write_bytes(whole[:position] + bytes([whole[position] ^ 1 << bit]) + whole[position + 1 :])
-            try:
-                found = archive.read_record(tmp_path / "state")
-            except StorageError as error:
-                assert str(error).startswith(str(path))
-            else:
-                assert found == content  # such as 1E-05 for 1e-05
-                harmless += 1
+        flipped = whole[position] ^ 1 << position % 8
+        path.write_bytes(whole[:position] + bytes([flipped]) + whole[position + 1 :])
+        try:
+            found = archive.read_record(tmp_path / "state")
+        except StorageError as error:
+            assert str(error).startswith(str(path))
+        else:
+            assert found == content  # such as 1E-05 for 1e-05
+            harmless += 1
     assert harmless <= 2
 
 
