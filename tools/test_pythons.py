@@ -59,8 +59,9 @@ def run(command: list[str], log: Path, cwd: Path = ROOT) -> bool:
 def try_python(python: str, versions: str, folder: Path, wheel: Path, log: Path) -> str:
     """Install and test in a fresh environment, into a log.  Returns what came of it."""
     folder.mkdir(parents=True)
-    # The tests of the checkout, the package of the wheel: it is not on the path of a copy.
-    shutil.copytree(ROOT / "tests", folder / "tests", ignore=shutil.ignore_patterns("__pycache__"))
+    # The tests of the checkout and their maneuver files, the package of the wheel: it is not on the path of a copy.
+    for name in ("tests", "examples"):
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     (folder / "pytest.ini").write_text("[pytest]\npythonpath = tests\nmarkers =\n    slow\n    gpu\n")
     environment = folder / "venv"
     pip = [str(environment / "bin" / "python"), "-m", "pip", "install", "-qq"]
