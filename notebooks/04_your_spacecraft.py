@@ -59,11 +59,11 @@ print(table(before, name="universal"))
 
 # %% [markdown]
 # ## One of its own
-# The settings of notebook 2 in units of this spacecraft, as `koz train --spacecraft FILE` makes them. Such an agent
-# must be trained again for every change of the spacecraft.
+# The default training, in units of this spacecraft, as `koz train --spacecraft FILE` makes it. Such an agent must be
+# trained again for every change of the spacecraft.
 
 # %%
-config = for_spacecraft(preset("short"), mine)
+config = for_spacecraft(preset("fast"), mine)
 run = Path("runs", "my-spacecraft")
 train(config, run, progress=False)
 agent = load_agent(run)
@@ -73,9 +73,8 @@ after = monte_carlo(agent, cases=cases)
 print(table(after, name="my agent"))
 
 # %% [markdown]
-# That was a short training: `preset("fast")` and `preset("thorough")` train longer, `preset("universal")` for
-# all spacecraft. What is left of cases that look into a zone is what the shield is for:
-# `monte_carlo(agent, task=mine, shield=ShieldConfig())`.
+# `preset("thorough")` trains longer, `preset("universal")` for all spacecraft. What is left of cases that look into a
+# zone is what the shield is for: `monte_carlo(agent, task=mine, shield=ShieldConfig())`.
 
 # %%
 figure, (left, right) = plt.subplots(1, 2, layout="constrained")

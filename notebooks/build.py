@@ -39,6 +39,7 @@ LEAST_DPI = 86.4
 # What a small budget puts in place of what a notebook says.
 _CHEAPER = {
     'preset("short")': 'preset("smoke")',
+    'preset("fast")': 'preset("smoke")',
     "cases=500": "cases=100",
     "cases=5_000": "cases=100",
     "cases = 2_000": "cases = 100",
