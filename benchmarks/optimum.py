@@ -1,4 +1,4 @@
-"""How far an agent for any spacecraft is from the best flight of each maneuver, by the cost that it was refined with.
+"""How far an agent for any spacecraft is from the best flight of each maneuver, by the cost of the preset ``universal``.
 
     python benchmarks/optimum.py [--agent NAME] [--cases N] [--iterations N] [--random] [--markdown FILE]
 

@@ -27,7 +27,7 @@ def _spread(given: TaskConfig, task: TaskConfig) -> SpreadConfig:
 
 
 # How a policy in units and axes of its spacecraft is refined: that of Soft Actor-Critic chatters, so its gradients are
-# bounded over the steps and for each maneuver, and Adam's steps with so many constant inputs are too large for it.
+# bounded over the steps and for each maneuver.  By Adam at the presets' learning rate it unlearns the maneuver.
 _REFINED = {
     "optimizer": "muon",
     "learning_rate": 2e-3,

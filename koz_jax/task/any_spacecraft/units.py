@@ -65,7 +65,7 @@ def torque_for(acceleration_P: jax.Array, axes: jax.Array, model: Model) -> jax.
 def time_of_torque(change_B: jax.Array, box_B: jax.Array, model: Model) -> jax.Array:
     """Time [s] for which a torque box has to push along the momentum of a rate, until that is there or gone.
 
-    change_B: (3,) [rad/s] in body axes; box_B: (3,) [N m].  Of an angle (3,) [rad] instead, it is the time's square
-    over two [s^2]: by so much a body at rest turns.  Returns ().
+    change_B: (3,) [rad/s] in body axes; box_B: (3,) [N m].  For an angle (3,) [rad] in place of the rate it is t^2 / 2
+    [s^2] of the time t in which a body at rest is turned by it.  Returns ().
     """
     return jnp.max(jnp.abs(dynamics.matvec(model.inertia_B, change_B)) / box_B)
