@@ -1,4 +1,4 @@
-"""How far an agent for any spacecraft is from the best flight of each maneuver, by the cost of the preset ``universal``.
+"""How far an agent for any spacecraft is from the best flight of each maneuver, by the cost of preset universal.
 
     python benchmarks/optimum.py [--agent NAME] [--cases N] [--iterations N] [--random] [--markdown FILE]
 

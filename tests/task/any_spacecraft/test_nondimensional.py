@@ -8,6 +8,7 @@ from support.states import directions, quaternions
 
 from koz_jax.config.task import SpacecraftConfig, TaskConfig
 from koz_jax.task import dynamics, pointing_constraints, rotations, state
+from koz_jax.task.actuators import TorqueBox
 from koz_jax.task.any_spacecraft import nondimensional, units
 from koz_jax.task.dynamics import RigidBodyState
 from koz_jax.task.environment import model_from_config
@@ -105,10 +106,13 @@ def test_it_is_time_to_brake_where_stopping_takes_as_long_as_turning():
         assert float(seen[WHERE["turning"]][0]) == pytest.approx(half_square, rel=1e-3)
 
 
-def test_the_time_to_stop_is_bounded():
+def test_times_are_bounded():
+    """Of a rate that takes long to stop, and of a weak axis that is hardly turned at all."""
     model = spacecraft()
-    seen = nondimensional.observe(maneuver(model, rate=1e3), model, 0.5)
+    weak = model.replace(actuators=TorqueBox(model.actuators.limit_B * jnp.array([1e-3, 1.0, 1.0])))
+    seen = nondimensional.observe(maneuver(weak, rate=1e3), weak, 0.5)
     np.testing.assert_array_equal(seen[WHERE["stopping"]], [LONGEST_TIME, LONGEST_TIME**2 / 2])
+    np.testing.assert_array_equal(seen[WHERE["turning"]], [LONGEST_TIME**2 / 2])
 
 
 def test_an_action_is_an_angular_acceleration_along_the_policys_axes():
