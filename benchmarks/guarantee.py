@@ -22,7 +22,8 @@ from koz_jax.agents.agent import load_agent
 from koz_jax.cli.exit_status import exit_status
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.shield import ShieldConfig
-from koz_jax.config.task import TaskConfig
+from koz_jax.config.spread import SpreadConfig
+from koz_jax.config.task import ScenarioConfig, TaskConfig
 from koz_jax.config.uncertainty import UncertaintyConfig
 from koz_jax.control.adversarial import AnyAdversary
 from koz_jax.control.base import Controller
@@ -67,6 +68,7 @@ def trials() -> list[Trial]:
         Trial("starts at up to 10 deg/s per axis", ADVERSARIAL, 10_000, TaskConfig().with_rules(max_rate_deg=10.0))
     )
     found.append(Trial("errors of all kinds", (*ADVERSARIAL, "phase2"), 10_000, errors=ERRORS))
+    found += [Trial(f"random spacecraft, {title}", ADVERSARIAL, 10_000, task) for title, task in _random().items()]
     for step in (0.05, 0.1, 0.2, 0.5):
         task = TaskConfig.model_validate({**CUBESAT, "step_seconds": step})
         found.append(Trial(f"6U CubeSat, steps of {step:g} s", ("adversary", "pd"), 1_000, task))
@@ -79,6 +81,28 @@ def trials() -> list[Trial]:
             title = f"disturbance of {disturbance:g} N m for 300 s, {_zones(zones)}"
             found.append(Trial(title, ("adversary",), 500, task, errors))
     return found
+
+
+def _random() -> dict[str, TaskConfig]:
+    """Tasks in which every case is of another spacecraft, by what they have."""
+    anyone = SpreadConfig(spacecraft=True)
+
+    def of(scenario: ScenarioConfig | None = None, **changes: Any) -> TaskConfig:
+        return TaskConfig(spread=anyone.model_copy(update=changes), scenario=scenario or ScenarioConfig())
+
+    return {
+        "1 to 4 zones": of(zones=(1, 4)),
+        "slender, 1 to 4 zones": of(zones=(1, 4), slenderness=(0.05, 0.1)),
+        "four wheels in a pyramid with a bias": of(wheels="pyramid"),
+        "8 zones of 3 instruments, some to be kept in": of(zones=(8, 8), instruments=3, keep_in=0.4),
+        "at most 5 deg/s": of(max_rate_deg=(5.0, 5.0)),
+        "zones that turn by 0.2 deg/s": of(ScenarioConfig(cone_rate_deg=0.2)),
+        "steps of 0.05 to 1 T": of(step_shares=(0.05, 1.0)),
+        "zones of 2 to 89 deg": of(ScenarioConfig(min_half_angle_deg=2.0, max_half_angle_deg=89.0)),
+        "0.1 deg between zones, start and target": of(
+            ScenarioConfig(separation_deg=0.1, zone_gap_deg=0.0, infeasible_zone="shrink"), zones=(1, 4)
+        ),
+    }
 
 
 def _zones(count: int) -> str:

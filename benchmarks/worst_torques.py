@@ -21,12 +21,12 @@ import numpy as np
 import stamp
 
 from koz_jax.cli.exit_status import exit_status
+from koz_jax.config.filters import FilterConfig, for_cones
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.spread import SpreadConfig
-from koz_jax.config.task import TaskConfig
-from koz_jax.control.shield.filter import under_shield
+from koz_jax.config.task import ScenarioConfig, TaskConfig
+from koz_jax.control.filters.from_settings import under_filter
 from koz_jax.storage import runtime
-from koz_jax.task import rotations
 from koz_jax.task.environment import Reorientation
 from koz_jax.task.scenario import Scenario
 from koz_jax.task.state import EnvState
@@ -44,7 +44,6 @@ class Trial:
 
     title: str
     task: TaskConfig
-    cone_rate_deg: float = 0.0  # [deg/s] of every zone, about an axis that is drawn
 
 
 def trials() -> Iterator[Trial]:
@@ -61,7 +60,8 @@ def trials() -> Iterator[Trial]:
     yield Trial("random, at most 5 deg/s, 4 zones", of(zones=(4, 4), max_rate_deg=(5.0, 5.0)))
     yield Trial("random, four wheels in a pyramid, 4 zones", of(zones=(4, 4), wheels="pyramid"))
     yield Trial("random, long steps, 4 zones", of(zones=(4, 4), step_shares=(0.1, 0.5)))
-    yield Trial("random, zones that turn by 0.2 deg/s, 4 zones", of(zones=(4, 4)), cone_rate_deg=0.2)
+    turning = {"scenario": ScenarioConfig(cone_rate_deg=0.2)}
+    yield Trial("random, zones that turn by 0.2 deg/s, 4 zones", of(zones=(4, 4)).model_copy(update=turning))
 
 
 class Flight(NamedTuple):
@@ -94,14 +94,11 @@ def fly(env: Reorientation, scenario: Scenario, requests: jax.Array) -> Flight:
     return Flight(jnp.min(margins), torque_B, jnp.zeros(3) if held_B is None else held_B)
 
 
-def search(env: Reorientation, cone_rate: jax.Array, shield: ShieldConfig, key: jax.Array) -> Case:
+def search(env: Reorientation, shield: FilterConfig, key: jax.Array) -> Case:
     """Draw a case, and look for the requests that are worst in it."""
-    key_case, key_turn, key_search = jax.random.split(key, 3)
-    own = under_shield(env.drawn(key_case), shield)
+    key_case, key_search = jax.random.split(key)
+    own = under_filter(env.drawn(key_case), shield)
     drawn = own.sample(key_case)
-    if shield.cone_rate_deg:
-        about_N = jax.vmap(rotations.normalize)(jax.random.normal(key_turn, drawn.constraints.axis_N.shape))
-        drawn = drawn.replace(constraints=drawn.constraints.replace(axis_rate_N=cone_rate * about_N))
     shape = (STEPS // HELD, 3)
 
     def generation(carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
@@ -189,10 +186,10 @@ def _try_all(args: argparse.Namespace) -> int:
     for trial in trials():
         if args.only and not any(word in trial.title for word in args.only):
             continue
-        shield = ShieldConfig(cone_rate_deg=trial.cone_rate_deg)
+        shield = for_cones(ShieldConfig(), trial.task.scenario.cone_rate_deg)
         env = Reorientation.from_config(trial.task)
         keys = jax.random.split(jax.random.key(args.seed), args.cases)
-        one = functools.partial(search, env, jnp.deg2rad(trial.cone_rate_deg), shield)
+        one = functools.partial(search, env, shield)
         cases = jax.jit(functools.partial(jax.lax.map, one, batch_size=10))(keys)
         found, first = smallest_margins(cases), np.asarray(cases.first)
         row = [trial.title, "search", str(args.cases), str(int(np.sum(~(found > 0.0))))]

@@ -69,6 +69,11 @@ AnyFilter = Annotated[
 ]
 
 
+def for_cones(config: FilterConfig, rate_deg: float) -> FilterConfig:
+    """A filter that allows for cones that turn, if it does not already.  rate_deg: [deg/s] of the fastest axis."""
+    return config.model_copy(update={"cone_rate_deg": max(rate_deg, config.cone_rate_deg)})
+
+
 def filter_named(name: FilterName) -> FilterConfig:
     """A filter by its name, with its default settings."""
     return ZohCbfConfig() if name == "zoh_cbf" else ShieldConfig()

@@ -128,8 +128,10 @@ class RewardConfig(SettingsOfAgents):
     """Growth of phi in a step that still counts as progress [deg]; the paper counts a tie as none."""
 
 
-class ScenarioConfig(Settings):
+class ScenarioConfig(SettingsOfAgents):
     """What scenarios are drawn (the deviation range comes from the curriculum or the evaluation)."""
+
+    later: ClassVar = ("cone_rate_deg",)
 
     max_rate_deg: NonNegativeFloat = 0.001
     """Initial rates are uniform in plus or minus this, per axis [deg/s]."""
@@ -147,6 +149,9 @@ class ScenarioConfig(Settings):
     """Largest number of zones of a case: the first on the direct way, the others around it."""
     zone_gap_deg: NonNegativeFloat = 10.0
     """Least gap between the edges of two zones [deg]."""
+    cone_rate_deg: NonNegativeFloat = 0.0
+    """Rate at which the axes of zones turn, each about a random direction [deg/s]; separation and gap are those at the
+    start."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

@@ -199,6 +199,7 @@ class TrainConfig(Settings):
     def _can_be_shielded(self) -> Self:
         if self.shielding.in_force:
             self.shielding.in_force.check(self.task.spacecraft.brake_limits)
+            self.shielding.in_force.check_cones(self.task.scenario.cone_rate_deg)
         return self
 
     @model_validator(mode="after")

@@ -15,7 +15,7 @@ from flax import struct
 from jax.sharding import Mesh, PartitionSpec
 
 from koz_jax import devices
-from koz_jax.config.filters import FilterConfig
+from koz_jax.config.filters import FilterConfig, for_cones
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.task import TaskConfig, check_feasible
 from koz_jax.control.base import Controller, TaskController
@@ -88,9 +88,15 @@ def environment(task: TaskConfig, config: MonteCarloConfig) -> Reorientation:
     env = Reorientation.from_config(task, config.min_angle_deg, config.max_angle_deg, rule=rule)
     if config.uncertainty is not None:
         env = env.replace(uncertainty=uncertainty.from_config(config.uncertainty))
-    if config.shield is not None:
-        config.shield.check(task.spacecraft.brake_limits)
-    return under_filter(env, config.shield)
+    flown_under = _filter(task, config)
+    if flown_under is not None:
+        flown_under.check(task.spacecraft.brake_limits)
+    return under_filter(env, flown_under)
+
+
+def _filter(task: TaskConfig, config: MonteCarloConfig) -> FilterConfig | None:
+    """What is flown under, which allows for zones that turn."""
+    return None if config.shield is None else for_cones(config.shield, task.scenario.cone_rate_deg)
 
 
 def _key(config: MonteCarloConfig) -> jax.Array:
@@ -111,7 +117,8 @@ def _flight_key(key: jax.Array, index: jax.Array | int) -> jax.Array:
 def _flight(controller: Controller, task: TaskConfig, config: MonteCarloConfig) -> _Flight:
     env = environment(task, config)
     # Where every case has a spacecraft of its own, it also has a shield of its own.
-    return _Flight(env, controller, _key(config), config.substeps, None if env.spread is None else config.shield)
+    shield = None if env.spread is None else _filter(task, config)
+    return _Flight(env, controller, _key(config), config.substeps, shield)
 
 
 def draw_case(task: TaskConfig, config: MonteCarloConfig, case: jax.Array | int) -> Scenario:
@@ -234,10 +241,11 @@ def fly_scenario(
     right = maneuver.checked(drawn)
     maneuver.tell_of_another_boresight(right, flown.spacecraft.boresight)
     cautions.warn_of_differences(flying, flown)
-    cautions.warn_of_target(flying, right, how.shield)
+    flown_under = _filter(flown, how)
+    cautions.warn_of_target(flying, right, flown_under)
     rates = right.constraints.axis_rate_N
-    if how.shield is not None and rates is not None:
-        how.shield.check_cones(float(np.rad2deg(np.linalg.norm(rates, axis=1).max())))
+    if flown_under is not None and rates is not None:
+        flown_under.check_cones(float(np.rad2deg(np.linalg.norm(rates, axis=1).max())))
     flight = _flight(flying.controller, flown, how).of_case(case)
     return _keep_and_evaluate(flight, right, flight.flight_key(case))
 
@@ -253,7 +261,7 @@ def within_steps(history: History, task: TaskConfig, config: MonteCarloConfig, c
 
     Returns leaves (steps * substeps + 1, ...), with the settings' ``substeps``.
     """
-    env = _of_case(environment(task, config), _key(config), case, config.shield)
+    env = _of_case(environment(task, config), _key(config), case, _filter(task, config))
     return _within_steps(env, history, _flight_key(_key(config), case), config.substeps)
 
 

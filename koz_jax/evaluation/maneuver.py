@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
+from koz_jax.config.filters import for_cones
 from koz_jax.config.maneuvers.maneuver import ManeuverConfig
 from koz_jax.config.maneuvers.maneuver_tables import ConstraintConfig, fastest_cone_deg
 from koz_jax.config.monte_carlo import MonteCarloConfig
@@ -82,8 +83,7 @@ def config_of(maneuver: ManeuverConfig, config: MonteCarloConfig) -> MonteCarloC
     if maneuver.has_errors:
         changes["uncertainty"] = maneuver.errors.uncertainty
     if config.shield is not None:
-        cone_rate = max(fastest_cone_deg(maneuver.constraints), config.shield.cone_rate_deg)
-        changes["shield"] = config.shield.model_copy(update={"cone_rate_deg": cone_rate})
+        changes["shield"] = for_cones(config.shield, fastest_cone_deg(maneuver.constraints))
     return config.model_copy(update=changes)
 
 

@@ -34,6 +34,9 @@ _PLACES = 32
 # Separates the draw of a zone's instrument from that of its place.
 _INSTRUMENT = 0x494E53
 
+# Separates the draw of how zones turn from all others of a case.
+_TURNING = 0x5455524E
+
 # [rad] Smallest and largest half angle of a cone to keep an instrument in.
 _KEEP_IN = (np.deg2rad(60.0), np.deg2rad(100.0))
 
@@ -67,6 +70,7 @@ class ScenarioRanges(struct.PyTreeNode):
     zone_counts: jax.Array  # (2,) int32, least and largest number of zones
     keep_in: jax.Array  # () share of the other instruments' zones that are cones to keep them in
     others_B: jax.Array | None  # (n, 3) unit vectors of other instruments; None where there are none
+    cone_rate: jax.Array | None  # () [rad/s] at which the axes of zones turn; None where they stand still
     max_zones: int = struct.field(pytree_node=False)  # length of the stack of zones
 
 
@@ -150,6 +154,9 @@ def sample(key: jax.Array, ranges: ScenarioRanges, rule: SamplingRule = Sampling
     zones = PointingConstraint(ranges.boresight_B[None], draw.zone_axis_D[None], half_angle[None])
     if ranges.max_zones > 1:
         zones = _add_zones(jax.random.fold_in(key, _FURTHER), ranges, draw.q_e, zones)
+    if ranges.cone_rate is not None:
+        about_N = jax.random.normal(jax.random.fold_in(key, _TURNING), zones.axis_N.shape)
+        zones = zones.replace(axis_rate_N=ranges.cone_rate * jax.vmap(rotations.normalize)(about_N))
     return Scenario(
         initial=RigidBodyState(draw.q_e, draw.omega_BN_B),
         q_DN=jnp.array([1.0, 0.0, 0.0, 0.0]),
@@ -252,5 +259,6 @@ def from_config(task: TaskConfig, min_angle_deg: float, max_angle_deg: float) ->
         zone_counts=jnp.array([min_zones, max_zones], jnp.int32),
         keep_in=jnp.zeros(()),
         others_B=None,
+        cone_rate=jnp.deg2rad(jnp.float32(config.cone_rate_deg)) if config.cone_rate_deg else None,
         max_zones=max_zones,
     )

@@ -1,28 +1,28 @@
 """Cones whose axes turn: flown as they are, planned for, and kept out of by the shield."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from koz_jax import maneuver
+from koz_jax.config.base import checked
 from koz_jax.config.monte_carlo import MonteCarloConfig
+from koz_jax.config.presets.named import preset
 from koz_jax.config.shield import ShieldConfig
-from koz_jax.config.task import TaskConfig
+from koz_jax.config.task import ScenarioConfig, TaskConfig
+from koz_jax.config.training import ShieldingConfig, TrainConfig
 from koz_jax.control.adversarial import AnyAdversary
 from koz_jax.control.registry import load_controller
 from koz_jax.control.shield import filter as shield
-from koz_jax.control.shield.filter import under_shield
 from koz_jax.errors import SettingsError
-from koz_jax.evaluation import cases, rollout
-from koz_jax.evaluation.rollout import CaseResult
-from koz_jax.task import pointing_constraints, rotations
+from koz_jax.evaluation import cases
+from koz_jax.task import pointing_constraints
 from koz_jax.task.environment import Reorientation
 from koz_jax.task.scenario import Scenario
 
 RATE_DEG = 0.5  # eight times that of the Earth seen from a low orbit
 ENV = Reorientation.from_config(TaskConfig(episode_seconds=60.0))
-SHIELD = ShieldConfig(cone_rate_deg=RATE_DEG)
+TURNING = TaskConfig(episode_seconds=60.0, scenario=ScenarioConfig(cone_rate_deg=RATE_DEG))
 
 
 def sweeping(rate_deg: float) -> Scenario:
@@ -30,21 +30,6 @@ def sweeping(rate_deg: float) -> Scenario:
     axis = (0.5, 0.75**0.5, 0.0)
     zone = (axis, 20.0, (1.0, 0.0, 0.0), (0.0, 0.0, -rate_deg))
     return maneuver((1.0, 0.0, 0.0, 0.0), zones=[zone])
-
-
-def with_moving_zones(drawn: Scenario, key: jax.Array) -> Scenario:
-    """The same with an axis that turns anyhow."""
-    rate_N = jnp.deg2rad(RATE_DEG) * rotations.normalize(jax.random.normal(key, (3,)))
-    zones = drawn.constraints
-    return drawn.replace(constraints=zones.replace(axis_rate_N=jnp.broadcast_to(rate_N, zones.axis_N.shape)))
-
-
-@jax.jit
-def _fly(env: Reorientation, controller: AnyAdversary, keys: jax.Array) -> CaseResult:
-    def one(key: jax.Array) -> CaseResult:
-        return rollout.run_case(env, controller, with_moving_zones(env.sample(key), key), substeps=5, key=key)
-
-    return jax.vmap(one)(keys)
 
 
 @pytest.mark.slow
@@ -82,8 +67,8 @@ def test_the_shield_gets_out_of_the_way_of_a_cone_that_comes():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["random", "adversary", "spin_up"])
 def test_whoever_steers_into_a_cone_that_turns_does_not_get_there(name):
-    keys = jax.random.split(jax.random.key(7), 60)
-    found = _fly(under_shield(ENV, SHIELD), AnyAdversary.named(name), keys)
+    config = MonteCarloConfig(cases=60, seed=7, substeps=5, shield=ShieldConfig())
+    found = cases.fly_cases(AnyAdversary.named(name), TURNING, config)
     covered = ~np.asarray(found.unsafe_start)
     assert covered.sum() > 50
     assert not np.any(np.asarray(found.violated)[covered])
@@ -110,6 +95,12 @@ def test_a_plan_is_made_for_where_the_cone_will_be():
 def test_a_shield_for_slower_cones_is_refused_by_name():
     with pytest.raises(SettingsError, match=r"shield.cone_rate_deg: must be at least 0.5"):
         cases.fly_scenario(load_controller("pd"), sweeping(RATE_DEG), config=MonteCarloConfig(shield=ShieldConfig()))
+
+
+def test_training_under_a_shield_for_slower_cones_is_refused_by_name():
+    changes = {"task": TURNING, "shielding": ShieldingConfig(enabled=True)}
+    with pytest.raises(SettingsError, match=r"shield.cone_rate_deg: must be at least 0.5"):
+        checked(TrainConfig, **{**dict(preset("smoke")), **changes})
 
 
 def test_the_faster_cones_may_turn_the_farther_the_shield_keeps_away():

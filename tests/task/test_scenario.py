@@ -268,6 +268,23 @@ def test_paper_scenario_is_that_of_its_table():
 SEVERAL = ScenarioConfig(min_zones=1, max_zones=4)
 
 
+def test_zones_turn_at_the_rate_that_is_set_and_begin_as_those_that_stand_still(resampled):
+    turning = _draw(_ranges(80.0, 180.0, ScenarioConfig(cone_rate_deg=0.5)), RESAMPLE)
+    rates = turning.constraints.axis_rate_N
+    assert rates is not None
+    np.testing.assert_allclose(np.rad2deg(np.linalg.norm(rates, axis=-1)), 0.5, rtol=1e-6)
+    # Uniform over the sphere: each component of a direction is uniform in [-1, 1].
+    along = rates[:, 0] / np.linalg.norm(rates[:, 0], axis=-1, keepdims=True)
+    for component in range(3):
+        assert stats.kstest(along[:, component], stats.uniform(-1.0, 2.0).cdf).pvalue > UNLIKELY
+    for one, other in zip(
+        jax.tree.leaves(turning.replace(constraints=turning.constraints.replace(axis_rate_N=None))),
+        jax.tree.leaves(resampled),
+        strict=True,
+    ):
+        np.testing.assert_allclose(one, other, rtol=5e-7, atol=1e-7)  # two programs
+
+
 @pytest.fixture(scope="module")
 def crowded() -> Scenario:
     """Cases with one to four zones."""
