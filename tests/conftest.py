@@ -9,6 +9,8 @@ from pathlib import Path
 
 # Numbers are compared with those of the CPU: also where a GPU is present, and in subprocesses.
 os.environ["JAX_PLATFORMS"] = os.environ.get("KOZ_JAX_TEST_PLATFORM", "cpu")
+# Every worker has a core, on which several threads of PyTorch would wait for each other.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 # Most of the time goes into compiling: without optimisation that takes less than half, though loops run slower.
 _QUICK = ["--xla_backend_optimization_level=0"]
 if version("jaxlib").startswith("0.10."):  # others end a process at the name of a flag that they do not know
@@ -27,6 +29,9 @@ from koz_jax.task.environment import Reorientation
 # For the other workers, for subprocesses, and for the next session.
 runtime.keep_programs()
 
+# What is traced is kept: to look through it for garbage every few hundred objects takes 6 % of the time.
+gc.set_threshold(100_000, 50, 50)
+
 # The first example of a property compiles; a deadline would measure that.
 settings.register_profile("koz_jax", deadline=None, derandomize=True, max_examples=50)
 settings.load_profile("koz_jax")
@@ -39,7 +44,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 # Linux lets a process map 65,530 pieces of memory.  Every compiled program takes some, and past the limit XLA crashes.
-_MANY_MAPPINGS = 20_000
+_MANY_MAPPINGS = 40_000
 
 
 @pytest.fixture(scope="module", autouse=True)
