@@ -23,7 +23,7 @@ class ZohCbfConfig(Settings):
     disturbance_torque: NonNegativeFloat = 0.0
     """Norm of the torque from outside that it allows for [N m]."""
     cone_rate_deg: NonNegativeFloat = 0.0
-    """Largest rate of a cone's axis that it allows for [deg/s]; a maneuver file says its own."""
+    """Largest rate of a cone's axis that it allows for [deg/s]; a maneuver file or a draw says its own."""
     samples: PositiveInt = 2000
     """States in which its bounds are looked for."""
     seed: Seed = 0

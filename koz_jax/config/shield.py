@@ -60,7 +60,7 @@ class ShieldConfig(Settings):
     )
     """Errors for which the guarantee holds."""
     cone_rate_deg: NonNegativeFloat = 0.0
-    """Largest rate of a cone's axis that it is kept against [deg/s]; a maneuver file says its own."""
+    """Largest rate of a cone's axis that it is kept against [deg/s]; a maneuver file or a draw says its own."""
     guide_rate_deg: PositiveFloat | None = None
     """Rate with which the boresight is led around a zone [deg/s]; by default what suits the spacecraft."""
     samples: PositiveInt = 12
