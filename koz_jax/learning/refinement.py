@@ -119,6 +119,7 @@ class ManeuverCost(NamedTuple):
     """What a maneuver costs, and what its gradient in the weights is taken at."""
 
     mean: jax.Array  # () per step
+    entered: jax.Array  # () bool, whether a zone was entered
     observed: jax.Array  # (steps, entries) what the policy saw
 
 
@@ -140,7 +141,7 @@ def fly_maneuver(
 
     # To fly a step again on the way back is cheaper than to store everything that its gradient needs.
     @functools.partial(jax.checkpoint, prevent_cse=False)
-    def advance(state: EnvState, nudge: jax.Array) -> tuple[EnvState, tuple[jax.Array, jax.Array]]:
+    def advance(state: EnvState, nudge: jax.Array) -> tuple[EnvState, tuple[jax.Array, jax.Array, jax.Array]]:
         state = state if reach is None else state.replace(body=_limit_gradient(state.body, reach))
         measured = state if noise is None else env.measure(state, noise)
         observed = env.observe(measured)
@@ -150,11 +151,12 @@ def fly_maneuver(
         if largest is not None:
             rate = rotations.norm(stepped.state.body.omega_BN_B)
             cost = cost + config.refine.rate_weight * rate_cost(rate, largest)
-        return stepped.state, (cost, observed)
+        return stepped.state, (cost, stepped.outcome.zone_margin, observed)
 
     nudges = jnp.zeros((config.refine_steps, ACTION_SIZE)) if nudges is None else nudges
-    _, (costs, observed) = jax.lax.scan(advance, env.reset(key), nudges)
-    return ManeuverCost(jnp.mean(costs) * (env.model.dt / config.task.step_seconds), observed)
+    _, (costs, margins, observed) = jax.lax.scan(advance, env.reset(key), nudges)
+    entered = jnp.min(margins) < 0.0
+    return ManeuverCost(jnp.mean(costs) * (env.model.dt / config.task.step_seconds), entered, observed)
 
 
 @jax.custom_vjp
@@ -211,23 +213,25 @@ def _clipped_gradient(
     steps would be as many copies of all weights, read and written at every step.
     """
 
-    def action_slopes(key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        def flown(nudges: jax.Array) -> ManeuverCost:
-            return fly_maneuver(PolicyController(policy, config.network), env, key, config, reach, nudges)
+    def action_slopes(key: jax.Array) -> tuple[ManeuverCost, jax.Array]:
+        def flown(nudges: jax.Array) -> tuple[jax.Array, ManeuverCost]:
+            cost = fly_maneuver(PolicyController(policy, config.network), env, key, config, reach, nudges)
+            return cost.mean, cost
 
         nudges = jnp.zeros((config.refine_steps, ACTION_SIZE))
-        (cost, observed), slopes = jax.value_and_grad(flown, has_aux=True)(nudges)
-        return cost, observed, slopes
+        (_, cost), slopes = jax.value_and_grad(flown, has_aux=True)(nudges)
+        return cost, slopes
 
-    def weight_gradient(maneuver: tuple[jax.Array, jax.Array]) -> Params:
-        observed, slopes = maneuver
-        _, pull = jax.vjp(lambda policy: PolicyController(policy, config.network).act(observed), policy)
-        return _clipped(pull(slopes)[0], config.refine.max_maneuver_gradient)
+    def weight_gradient(maneuver: tuple[ManeuverCost, jax.Array]) -> Params:
+        cost, slopes = maneuver
+        _, pull = jax.vjp(lambda policy: PolicyController(policy, config.network).act(cost.observed), policy)
+        say = jnp.where(cost.entered, config.refine.violator_weight, 1.0)
+        return _clipped(pull(slopes)[0], say * config.refine.max_maneuver_gradient)
 
-    costs, observed, slopes = jax.vmap(action_slopes)(keys)
+    costs, slopes = jax.vmap(action_slopes)(keys)
     together = _TOGETHER_ON_GPU if devices.on_gpu() else None
-    gradients = jax.lax.map(weight_gradient, (observed, slopes), batch_size=together)
-    return jnp.mean(costs), jax.tree.map(lambda leaf: jnp.mean(leaf, axis=0), gradients)
+    gradients = jax.lax.map(weight_gradient, (costs, slopes), batch_size=together)
+    return jnp.mean(costs.mean), jax.tree.map(lambda leaf: jnp.mean(leaf, axis=0), gradients)
 
 
 @functools.partial(jax.jit, static_argnames="config", donate_argnames="state")

@@ -1,6 +1,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from koz_jax import devices
@@ -83,6 +84,25 @@ def test_gradients_of_maneuvers_that_no_bound_clips_have_the_mean_of_the_whole(p
     largest = max(float(jnp.max(jnp.abs(leaf))) for leaf in jax.tree.leaves(expected))
     for one, other in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-4 * largest)
+
+
+@pytest.mark.slow
+def test_a_maneuver_that_enters_a_zone_has_so_much_more_say(policy):
+    """Every gradient here is above its bound, so that its size is the bound."""
+    bound, weight = 1e-6, 8.0
+    refine = CONFIG.refine.model_copy(update={"max_maneuver_gradient": bound, "violator_weight": weight})
+    config = CONFIG.model_copy(update={"refine": refine})
+    tumbling = jax.tree.map(lambda leaf: 4.0 * leaf, policy)
+
+    @jax.jit
+    def of_one(key):
+        flown = refinement.fly_maneuver(PolicyController(tumbling, config.network), ENV, key, config)
+        _, gradient = refinement._clipped_gradient(config, ENV, tumbling, key[None], None)
+        return flown.entered, optax.tree.norm(gradient)
+
+    entered, sizes = map(np.asarray, zip(*map(of_one, KEYS), strict=True))
+    assert 0 < np.sum(entered) < len(KEYS)
+    np.testing.assert_allclose(sizes, np.where(entered, weight * bound, bound), rtol=1e-3)
 
 
 @pytest.mark.slow

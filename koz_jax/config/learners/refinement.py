@@ -25,6 +25,8 @@ class RefineConfig(Settings):
     has a huge gradient, which must not outvote the others."""
     max_maneuver_gradient: NonNegativeFloat = 0.0
     """The same for each maneuver by itself, so that all have a say; one that is not finite is left out.  0 does not."""
+    violator_weight: PositiveFloat = 1.0
+    """Factor on that bound for a maneuver that enters a zone: how much more say it has than another."""
     state_gradient: tuple[PositiveFloat, PositiveFloat] | None = None
     """Bound on the gradient that passes back from step to step, at the first iteration and from a quarter of them on: a
     policy that chatters has useful gradients over few steps only.  None sets no bound."""
