@@ -13,6 +13,7 @@ import numpy as np
 from flax import struct, traverse_util
 from pydantic import ValidationError
 
+from koz_jax.agents import deeper
 from koz_jax.agents.agent import load_agent
 from koz_jax.config.training import TrainConfig
 from koz_jax.control.policy import PolicyController
@@ -148,7 +149,7 @@ def load(folder: RunFolder, config: TrainConfig) -> Checkpoint:
 
 
 def load_agent_source(name: str | Path, config: TrainConfig) -> PolicyController:
-    """Load an agent for a run with ``config``, which only refines it.
+    """Load an agent for a run with ``config``, which only refines it; hidden layers that it has not are added.
 
     Raises:
         SettingsError: there is no such agent, or its network is another.
@@ -156,9 +157,12 @@ def load_agent_source(name: str | Path, config: TrainConfig) -> PolicyController
 
     """
     controller = load_agent(name).controller
-    if controller.network != config.network:
-        raise SettingsError(f"start_from: network must be that of {name}, {controller.network}, got {config.network}")
-    return controller
+    if not deeper.can_become(controller.network, config.network):
+        raise SettingsError(
+            f"start_from: network must be that of {name}, {controller.network}, or have further hidden layers of the"
+            f" last one's size; got {config.network}"
+        )
+    return deeper.deepened(controller, config.network)
 
 
 def load_source(folder: Path, config: TrainConfig) -> RunState:
