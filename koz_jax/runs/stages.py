@@ -116,6 +116,13 @@ class Stage(abc.ABC):
         passed = np.asarray(results.success if self.is_of_zones else results.settled)
         return float(np.mean(np.where(passed, rewards, 0.0)))
 
+    def is_better(self, score: float, best: float) -> bool:
+        """Tell whether an agent takes the place of the best: of equal ones, as where no case succeeds, the newer.
+
+        Refinement must do better than what it was given.
+        """
+        return score > best if self.improves_on_the_one_before else score >= best
+
     @abc.abstractmethod
     def begin_from(self, state: RunState) -> RunState:
         """Make the state that this stage begins with of the one that the stage before has ended with."""

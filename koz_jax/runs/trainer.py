@@ -255,7 +255,7 @@ class _Run:
         evaluated = self._fly(learner, stage) if processes.is_primary_process() else {"eval/score": math.nan}
         score = float(processes.broadcast_from_primary(np.float32(evaluated["eval/score"])))
         divergence.check_finite(done, NO_FAULT, {"eval/score": jnp.float32(score)})
-        if score > float(state.best_score):
+        if stage.is_better(score, float(state.best_score)):
             best = jax.tree.map(jnp.copy, learner)
             state = state.replace(best=best, best_score=jnp.float32(score), best_at=jnp.int32(done))
             out.agent(stage.agent, self._best_agent(state, stage))

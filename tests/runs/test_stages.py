@@ -43,6 +43,13 @@ def test_the_best_learner_of_phase_1_starts_phase_2(tmp_path, monkeypatch):
     assert_same_tree(agent.controller.policy, snapshot.best.averaged_policy)
 
 
+def test_of_equal_agents_the_newer_is_the_best_and_refinement_must_do_better():
+    *learning, refining = stages.plan(CONFIG)
+    assert all(stage.is_better(0.0, 0.0) for stage in learning) and not refining.is_better(0.0, 0.0)
+    for stage in (*learning, refining):
+        assert stage.is_better(1.0, 0.0) and stage.is_better(0.0, -np.inf) and not stage.is_better(0.0, 1.0)
+
+
 @pytest.mark.slow
 def test_refinement_begins_with_the_best_of_phase_2_and_the_best_of_all_is_returned(tmp_path, monkeypatch):
     scores = iter([1.0, 1.0, 4.0, 3.0, 5.0, 2.0])
