@@ -121,11 +121,14 @@ def test_the_file_is_given_by_its_place_or_by_a_flag():
 
 
 def test_flags_make_a_maneuver_of_the_agents_spacecraft():
-    found = parsed("--from", *HALF, "--to", 1, 0, 0, 0, "--keep-out", 0, 1.005, 0, 12).own_maneuver
+    cones = ["--keep-in", 0, 0, -1, 170, "--keep-out", 0, 1.005, 0, 12]
+    found = parsed("--from", *HALF, "--to", 1, 0, 0, 0, *cones).own_maneuver
     assert found is not None and found.task == TaskConfig()
     assert found.start.attitude == pytest.approx(HALF, abs=1e-5) and found.target.attitude == (1, 0, 0, 0)
-    (cone,) = found.constraints
-    assert (cone.direction, cone.half_angle_deg) == ((0.0, 1.0, 0.0), 12.0)
+    assert [(cone.kind, cone.direction, cone.half_angle_deg) for cone in found.constraints] == [
+        ("keep_out", (0.0, 1.0, 0.0), 12.0),
+        ("keep_in", (0.0, 0.0, -1.0), 170.0),
+    ]
 
 
 def _turn_of(spacecraft: SpacecraftConfig, tmp_path: Path) -> FlyFlags:
@@ -195,6 +198,11 @@ REFUSED_TURNS = {
     "no target": (("--from", 1, 0, 0, 0), "from: needs --to too"),
     "no start": (("--to", 1, 0, 0, 0), "to: needs --from too"),
     "cone alone": (("--keep-out", 1, 0, 0, 20), "keep_out: needs --from and --to"),
+    "cone to stay in alone": (("--keep-in", 1, 0, 0, 80), "keep_in: needs --from and --to"),
+    "second cone to stay in": (
+        (*TURN, "--keep-out", 0, 1, 0, 9, "--keep-in", 0, 0, 1, 99, "--keep-in", 0, 0, 2, 99),
+        "keep_in.1.direction: must be a unit vector, of length 1",
+    ),
     "body alone": (("--spacecraft", CUBESAT), "spacecraft: needs --from and --to"),
     "quaternion": (("--from", 1, 1, 0, 0, "--to", 1, 0, 0, 0), "from: must be a unit quaternion, scalar first"),
     "cone": ((*TURN, "--keep-out", 3, 4, 0, 20), "keep_out.0.direction: must be a unit vector, of length 1"),

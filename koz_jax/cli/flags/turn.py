@@ -17,8 +17,10 @@ from koz_jax.errors import explain
 
 FourNumbers = tuple[float, float, float, float]
 
-# Where a flag ends up in the maneuver, for messages.
-_FLAGS = {"start.attitude": "from", "target.attitude": "to", "constraints.": "keep_out."}
+Cones = Annotated[tuple[FourNumbers, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="X Y Z HALF_ANGLE")]
+
+# Kinds of cones, as flags and in a maneuver.
+_KINDS = ("keep_out", "keep_in")
 
 # What the spacecraft's own instrument is called where nobody has named it.
 _INSTRUMENT = "boresight"
@@ -31,10 +33,10 @@ class TurnFlags(Settings):
     """Fly from this attitude (scalar first, body relative to inertial), at rest."""
     target: Annotated[FourNumbers | None, tyro.conf.arg(name="to", metavar="W X Y Z")] = None
     """Fly to this attitude."""
-    keep_out: Annotated[
-        tuple[FourNumbers, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="X Y Z HALF_ANGLE")
-    ] = ()
+    keep_out: Cones = ()
     """With --from and --to: a cone to stay out of, its axis in inertial axes and its half angle [deg]."""
+    keep_in: Cones = ()
+    """With --from and --to: a cone to stay in, its axis in inertial axes and its half angle [deg]."""
     spacecraft: Path | None = None
     """With --from and --to: a TOML file with a table [spacecraft] and step_seconds, such as a maneuver file, whose
     first instrument is taken; by default the agent's spacecraft, with its actuators and rate limit."""
@@ -44,8 +46,9 @@ class TurnFlags(Settings):
         if (self.start is None) != (self.target is None):
             here, missing = ("from", "to") if self.target is None else ("to", "from")
             raise ValueError(f"{here}: needs --{missing} too")
-        if self.start is None and (self.keep_out or self.spacecraft is not None):
-            raise ValueError(f"{'keep_out' if self.keep_out else 'spacecraft'}: needs --from and --to")
+        alone = [name for name in ("keep_out", "keep_in", "spacecraft") if getattr(self, name)]
+        if self.start is None and alone:
+            raise ValueError(f"{alone[0]}: needs --from and --to")
         return self
 
     def turn(self, own: TaskConfig) -> ManeuverConfig:
@@ -72,9 +75,12 @@ class TurnFlags(Settings):
             if not found.instruments:
                 given["instruments"] = [{"name": _INSTRUMENT, "boresight": own.spacecraft.boresight}]
         instrument = given["instruments"][0]["name"]
+        of_flags = {
+            f"{kind}.{number}": (kind, cone) for kind in _KINDS for number, cone in enumerate(getattr(self, kind))
+        }
         cones = [
-            {"instrument": instrument, "direction": (x, y, z), "half_angle_deg": angle}
-            for x, y, z, angle in self.keep_out
+            {"instrument": instrument, "kind": kind, "direction": (x, y, z), "half_angle_deg": angle}
+            for kind, (x, y, z, angle) in of_flags.values()
         ]
         ends = {"start": {"attitude": self.start}, "target": {"attitude": self.target}}
         try:
@@ -82,7 +88,9 @@ class TurnFlags(Settings):
                 {"name": "a turn of one's own"} | given | ends | {"constraints": cones}
             )
         except ValidationError as error:
+            flags = {"start.attitude": "from", "target.attitude": "to"}
+            flags |= {f"constraints.{number}.": f"{flag}." for number, flag in enumerate(of_flags)}
             message = explain(error)
-            for place, flag in _FLAGS.items():
+            for place, flag in flags.items():
                 message = message.replace(place, flag)
             raise ValueError(message) from None
