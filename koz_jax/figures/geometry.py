@@ -21,6 +21,12 @@ class Zone:
     axis_N: np.ndarray  # (3,) unit vector
     half_angle: float  # [rad]
     last_axis_N: np.ndarray | None = None  # (3,) axis at the end of the maneuver; None where it does not turn
+    rate_N: np.ndarray | None = None  # (3,) [rad/s] angular velocity of the axis; None where it does not turn
+
+    @property
+    def turns(self) -> bool:
+        """Whether its axis turns."""
+        return self.rate_N is not None
 
     @property
     def size(self) -> str:
@@ -40,14 +46,15 @@ def zones(history: History) -> list[Zone]:
         jax.tree.map(lambda leaf, at=at: np.asarray(leaf[at], np.float64), history.state.scenario.constraints)
         for at in (0, -1)
     )
-    turns = first.axis_rate_N is not None and np.any(first.axis_rate_N, axis=1)
-    turns = np.broadcast_to(turns, first.half_angle.shape)
+    rates_N = np.zeros_like(first.axis_N) if first.axis_rate_N is None else first.axis_rate_N
+    turns = np.any(rates_N, axis=1)
     own = np.all(np.isclose(first.boresight_B, first.boresight_B[0]), axis=1)
     return [
         Zone(
             attitudes.normalized(first.axis_N[i]),
             float(first.half_angle[i]),
             attitudes.normalized(last.axis_N[i]) if turns[i] else None,
+            rates_N[i] if turns[i] else None,
         )
         for i in np.flatnonzero(own & (first.half_angle > 0.0))
     ]
@@ -92,6 +99,13 @@ def shortest_path(
         return rotations.rotate(q_LN, jnp.asarray(boresight_B))
 
     return np.asarray(jax.vmap(looking)(jnp.linspace(angle, 0.0, points)), np.float64)
+
+
+def zone_turns(zone: Zone, seconds: np.ndarray) -> np.ndarray:
+    """How far a zone has turned since the start.  seconds: (n,) [s].  Returns quaternions (n, 4)."""
+    rate_N = np.zeros(3) if zone.rate_N is None else zone.rate_N
+    speed = np.linalg.norm(rate_N)
+    return attitudes.turn_about(rate_N / (speed or 1.0), speed * seconds)
 
 
 def zone_circle(zone: Zone, points: int = 361) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The spacecraft as a solid: points in body axes, which the page turns with the attitude."""
+"""The spacecraft as a solid, in body axes: the page turns it with the attitude."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ import numpy as np
 from koz_jax.figures import geometry, palette
 from koz_jax.figures.geometry import Zone
 from koz_jax.figures.palette import SCENE_AXES
-from koz_jax.viewer.rounding import rounded
+from koz_jax.viewer.rounding import coordinates
 
 _LONGEST = 0.26  # half of the box's longest side; the sphere has radius 1
 _AXIS = 0.52  # length of the body axes
@@ -31,7 +31,7 @@ def half_sides(inertia: np.ndarray) -> np.ndarray:
 
 
 def solid(inertia: np.ndarray, boresight_B: np.ndarray) -> list[dict[str, Any]]:
-    """Traces of the body, their coordinates in body axes under ``points``: a list of (x, y, z), or None for a gap.
+    """Traces of the body, in body axes.
 
     inertia: (3, 3) [kg m^2]; boresight_B: (3,) unit vector.
     """
@@ -42,17 +42,18 @@ def solid(inertia: np.ndarray, boresight_B: np.ndarray) -> list[dict[str, Any]]:
     mesh = {"type": "mesh3d", "hoverinfo": "skip", "flatshading": True, "lighting": shade}
     line = {"type": "scatter3d", "mode": "lines", "hoverinfo": "skip"}
     tube, (i, j, k) = _telescope(boresight_B)
-    edges = [point for start, end in _EDGES for point in (*rounded(box[[start, end]]), None)]
+    gap = np.full(3, np.nan)
+    edges = np.array([point for start, end in _EDGES for point in (*box[[start, end]], gap)])
     traces_B = [
-        mesh | {"name": "body", "i": a, "j": b, "k": c, "facecolor": faces, "points": rounded(box)},
-        line | {"name": "body edges", "line": {"color": "#3A4047", "width": 3}, "points": edges},
-        mesh | {"name": "telescope", "i": i, "j": j, "k": k, "color": "#3A4047", "points": rounded(tube)},
+        mesh | {"name": "body", "i": a, "j": b, "k": c, "facecolor": faces} | coordinates(box),
+        line | {"name": "body edges", "line": {"color": "#3A4047", "width": 3}} | coordinates(edges),
+        mesh | {"name": "telescope", "i": i, "j": j, "k": k, "color": "#3A4047"} | coordinates(tube),
         line
         | {
             "name": "line of sight",
             "line": {"color": palette.TRACE, "width": 2},
-            "points": rounded(np.array([_AXIS * boresight_B, boresight_B])),
-        },
+        }
+        | coordinates(np.array([_AXIS * boresight_B, boresight_B])),
     ]
     for axis, direction in zip(SCENE_AXES, np.eye(3), strict=True):
         axis_line = {
@@ -61,9 +62,8 @@ def solid(inertia: np.ndarray, boresight_B: np.ndarray) -> list[dict[str, Any]]:
             "text": ["", axis],
             "textfont": {"color": SCENE_AXES[axis], "size": 15},
             "line": {"color": SCENE_AXES[axis], "width": 7},
-            "points": rounded(np.array([0.0 * direction, _AXIS * direction])),
         }
-        traces_B.append(line | axis_line)
+        traces_B.append(line | axis_line | coordinates(np.array([0.0 * direction, _AXIS * direction])))
     return traces_B
 
 

@@ -58,6 +58,7 @@ class Clock:
 class Frames:
     """One maneuver at the instants of a ``Clock``; leading axis: frames."""
 
+    seconds: np.ndarray  # (frames,) [s] since the start
     q_BN: np.ndarray  # (frames, 4)
     boresight_N: np.ndarray  # (frames, 3)
     torque_B: np.ndarray  # (frames, 3) [N m]
@@ -125,6 +126,7 @@ def frames(maneuver: Maneuver, at: Clock) -> Frames:
         return np.interp(steps, np.arange(maneuver.steps + 1), np.rad2deg(angles))
 
     return Frames(
+        seconds=np.minimum(at.times, maneuver.seconds),
         q_BN=np.asarray(history.state.body.q_BN)[instants],
         boresight_N=geometry.boresight_trace(history)[instants],
         torque_B=np.asarray(history.torque_B)[instants],

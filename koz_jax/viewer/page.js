@@ -36,7 +36,7 @@
   }
 
   // ---- one instant of one maneuver
-  // v + 2 q0 (q x v) + 2 q x (q x v): body components to inertial ones.
+  // v + 2 q0 (q x v) + 2 q x (q x v), as from body components to inertial ones.
   function rotate([q0, q1, q2, q3], point) {
     if (point === null) return [null, null, null];
     const [x, y, z] = point;
@@ -48,27 +48,28 @@
     ];
   }
 
-  function sceneAt(maneuver, frame) {
-    const { data, turning } = maneuver.scene;
+  // What Plotly.restyle takes: new values for some traces, by their numbers.
+  function sceneAt({ data, turning }, frame) {
     const found = { x: [], y: [], z: [], "line.color": [] };
     const indices = [];
-    data.forEach((trace, index) => {
-      let points = null;
-      let colors = trace.line && trace.line.color;
-      if (trace.name in turning) {
-        points = turning[trace.name].map((point) => rotate(maneuver.attitude[frame], point));
-      } else if (trace.name === "now" || trace.name === "boresight trail") {
-        const trail = data.find((other) => other.name === "boresight trail");
-        const from = trace.name === "now" ? frame : 0;
-        points = [];
-        for (let i = from; i <= frame; i += 1) points.push([trail.x[i], trail.y[i], trail.z[i]]);
-        if (trace === trail) colors = trace.line.color.slice(0, frame + 1);
-      }
-      if (points === null) return;
+    function put(index, points, colors) {
       indices.push(index);
       ["x", "y", "z"].forEach((axis, i) => found[axis].push(points.map((point) => point[i])));
       found["line.color"].push(colors);
-    });
+    }
+    const pointsOf = ({ x, y, z }) => x.map((_, i) => (x[i] === null ? null : [x[i], y[i], z[i]]));
+
+    for (const { traces, turns } of turning) {
+      for (const index of traces) {
+        const { line } = data[index];
+        put(index, pointsOf(data[index]).map((point) => rotate(turns[frame], point)), line && line.color);
+      }
+    }
+    const named = (name) => data.findIndex((trace) => trace.name === name);
+    const trail = data[named("boresight trail")];
+    const seen = pointsOf(trail).slice(0, frame + 1);
+    put(named("boresight trail"), seen, trail.line.color.slice(0, frame + 1));
+    put(named("now"), seen.slice(-1));
     return [found, indices];
   }
 
@@ -89,7 +90,7 @@
         view.drawn = frame;
         view.readout.textContent = readoutAt(view.maneuver, frame);
         await Plotly.relayout(view.timeline, { "shapes[0].x0": time, "shapes[0].x1": time });
-        await Plotly.restyle(view.scene, ...sceneAt(view.maneuver, frame));
+        await Plotly.restyle(view.scene, ...sceneAt(view.maneuver.scene, frame));
       }
     } finally {
       view.busy = false;

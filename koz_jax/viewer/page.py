@@ -13,7 +13,6 @@ from koz_jax.errors import SettingsError, missing_extra
 from koz_jax.figures import geometry, wording
 from koz_jax.storage import files
 from koz_jax.viewer.maneuver import Clock, Frames, Maneuver, clock, frames, same_spacecraft
-from koz_jax.viewer.rounding import rounded
 from koz_jax.viewer.scene import scene
 from koz_jax.viewer.timeline import timelines
 
@@ -118,7 +117,6 @@ def _maneuver(flown: Maneuver, shown: Frames, timeline: dict[str, Any]) -> dict[
         "scene": scene(flown, shown),
         "timeline": timeline,
         "torqueUnit": wording.torque_unit(flown.task.spacecraft.torque_limits).name,
-        "attitude": rounded(shown.q_BN, 5),
     }
 
 

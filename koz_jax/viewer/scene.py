@@ -8,7 +8,7 @@ from koz_jax.figures import geometry, palette
 from koz_jax.figures.geometry import SphereTraces, Zone
 from koz_jax.viewer import body
 from koz_jax.viewer.maneuver import Frames, Maneuver
-from koz_jax.viewer.rounding import rounded
+from koz_jax.viewer.rounding import coordinates, rounded
 
 # Lines lie on the unit sphere, surfaces a little below it, so that the lines are not drawn half inside them.
 _BALL_RADIUS = 0.985
@@ -21,27 +21,32 @@ _TILT = 0.3  # tangent of how far the camera stands beside the middle of the pat
 
 
 def scene(maneuver: Maneuver, frames: Frames) -> dict[str, Any]:
-    """A plotly figure, and the points in body axes of those of its traces that turn with the body.
+    """A plotly figure, and which of its traces turn: their numbers, and a quaternion for every frame.
 
-    The page cuts the trail, and turns the body, to the instant shown.
+    The page cuts the trail, and turns the body and the zones, to the instant shown.
     """
     drawn = geometry.sphere_traces(maneuver.history)
-    zones = [part for zone in drawn.zones for part in _zone(zone)]
-    if len(drawn.zones) > 1:
-        zones.append(_numbers(drawn.zones))
-    fixed = [*_ball(), *zones, _shortest(drawn.shortest_N), _cross("start", drawn.shortest_N[0], palette.SHORTEST)]
-    fixed.append(_dot("target", drawn.shortest_N[-1], palette.TARGET, 9))
-    moving = [_trail(frames), _dot("now", frames.boresight_N[0], palette.TRACE, 6)]
+    parts: list[tuple[list[dict[str, Any]], np.ndarray | None]] = [(_ball(), None)]
+    for number, zone in enumerate(drawn.zones, 1):
+        turn = geometry.zone_turns(zone, frames.seconds) if zone.turns else None
+        parts.append((_zone(zone, number if len(drawn.zones) > 1 else None), turn))
+    ways = [_shortest(drawn.shortest_N), _cross("start", drawn.shortest_N[0], palette.SHORTEST)]
+    ways += [_dot("target", drawn.shortest_N[-1], palette.TARGET, 9)]
+    ways += [_trail(frames), _dot("now", frames.boresight_N[0], palette.TRACE, 6)]
     solid = body.solid(np.array(maneuver.task.spacecraft.inertia), geometry.boresight(maneuver.history))
-    turning = {trace["name"]: trace.pop("points") for trace in solid}
-    return {"data": [*fixed, *moving, *solid], "layout": _layout(drawn), "turning": turning}
+    parts += [(ways, None), (solid, frames.q_BN)]
+    data, turning = [], []
+    for traces, turn in parts:
+        if turn is not None:
+            turning.append({"traces": [len(data) + i for i in range(len(traces))], "turns": rounded(turn, 5)})
+        data += traces
+    return {"data": data, "layout": _layout(drawn), "turning": turning}
 
 
 def line(name: str, points: np.ndarray, **look: Any) -> dict[str, Any]:
     """Make a 3-D line.  points: (n, 3), nan for a gap."""
-    x, y, z = ([None if np.isnan(value) else value for value in row] for row in rounded(points.T))
     trace = {"type": "scatter3d", "mode": "lines", "name": name, "hoverinfo": "skip"}
-    return trace | {"line": look, "x": x, "y": y, "z": z}
+    return trace | {"line": look} | coordinates(points)
 
 
 def _sheet(name: str, points: np.ndarray, color: str, opacity: float) -> dict[str, Any]:
@@ -50,10 +55,9 @@ def _sheet(name: str, points: np.ndarray, color: str, opacity: float) -> dict[st
     corner = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]
     i, j, k = np.concatenate([np.stack([a, b, c]).reshape(3, -1), np.stack([a, c, d]).reshape(3, -1)], axis=1).tolist()
-    x, y, z = rounded(points.reshape(-1, 3).T, 3)
     light = {"ambient": 0.95, "diffuse": 0.1, "specular": 0.0, "fresnel": 0.0}
     look = {"type": "mesh3d", "name": name, "color": color, "opacity": opacity, "hoverinfo": "skip", "lighting": light}
-    return look | {"x": x, "y": y, "z": z, "i": i, "j": j, "k": k}
+    return look | {"i": i, "j": j, "k": k} | coordinates(points.reshape(-1, 3), 3)
 
 
 def _ball() -> list[dict[str, Any]]:
@@ -67,26 +71,26 @@ def _ball() -> list[dict[str, Any]]:
     ]
 
 
-def _zone(zone: Zone) -> list[dict[str, Any]]:
-    """A keep-out zone: its edge on the sphere, the cap inside, and the cone from the spacecraft to the edge."""
+def _zone(zone: Zone, number: int | None) -> list[dict[str, Any]]:
+    """A keep-out zone: its edge on the sphere, the cap inside, the cone from the spacecraft to the edge, its number."""
     edge = geometry.zone_circle(zone, 91)
     shares = np.linspace(0.0, 1.0, 7)
     cap = [geometry.zone_circle(Zone(zone.axis_N, share * zone.half_angle), 61) for share in shares]
     cone = np.stack([0.0 * cap[-1], cap[-1]])
-    return [
+    traces = [
         _sheet("zone", _CAP_RADIUS * np.stack(cap), palette.ZONE, 0.4),
         _sheet("zone cone", _CAP_RADIUS * cone, palette.ZONE, 0.15),
         line("zone edge", edge, color=palette.ZONE, width=6),
     ]
+    return traces if number is None else [*traces, _number(zone, number)]
 
 
-def _numbers(zones: list[Zone]) -> dict[str, Any]:
-    """The number of each zone, in the middle of its edge: inside the edge from wherever one looks."""
-    x, y, z = rounded(np.stack([max(np.cos(zone.half_angle), 0.3) * zone.axis_N for zone in zones], axis=1))
-    font = {"color": "#4A1F00", "size": 18}
-    trace = {"type": "scatter3d", "mode": "text", "name": "zone numbers", "hoverinfo": "skip", "textfont": font}
-    trace |= {"textposition": "middle center"}
-    return trace | {"text": [f"<b>{number}</b>" for number in range(1, len(zones) + 1)], "x": x, "y": y, "z": z}
+def _number(zone: Zone, number: int) -> dict[str, Any]:
+    """The number of a zone, in the middle of its edge: inside the edge from wherever one looks."""
+    place = max(np.cos(zone.half_angle), 0.3) * zone.axis_N
+    trace = {"type": "scatter3d", "mode": "text", "name": "zone number", "text": [f"<b>{number}</b>"]}
+    look = {"hoverinfo": "skip", "textposition": "middle center", "textfont": {"color": "#4A1F00", "size": 18}}
+    return trace | look | coordinates(place[None])
 
 
 def _shortest(path: np.ndarray) -> dict[str, Any]:
@@ -108,9 +112,8 @@ def _cross(name: str, point: np.ndarray, color: str) -> dict[str, Any]:
 
 def _dot(name: str, point: np.ndarray, color: str, size: int) -> dict[str, Any]:
     marker = {"color": color, "size": size, "line": {"color": "#FFFFFF", "width": 1}}
-    x, y, z = rounded(point[:, None])
     trace = {"type": "scatter3d", "mode": "markers", "name": name, "marker": marker, "hoverinfo": "skip"}
-    return trace | {"x": x, "y": y, "z": z}
+    return trace | coordinates(point[None])
 
 
 def _layout(drawn: SphereTraces) -> dict[str, Any]:

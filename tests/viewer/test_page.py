@@ -14,6 +14,7 @@ from support.drawn import CUBESAT
 from support.tiny import CONFIG, untrained_agent
 
 from koz_jax.agents.agent import Agent
+from koz_jax.config import attitudes
 from koz_jax.config.monte_carlo import MonteCarloConfig
 from koz_jax.config.shield import ShieldConfig
 from koz_jax.config.task import TaskConfig
@@ -141,7 +142,8 @@ def test_frames_cover_the_maneuver(flown, content):
     assert content["frameSeconds"] == pytest.approx(0.1)
     assert content["frames"] == 121 == flown[0].steps + 1
     for maneuver in content["maneuvers"]:
-        assert len(maneuver["attitude"]) == 121 == len(points(maneuver, "boresight trail"))
+        assert len(points(maneuver, "boresight trail")) == 121
+        assert all(len(group["turns"]) == 121 for group in maneuver["scene"]["turning"])
         assert all(len(curve["y"]) == 121 for curve in maneuver["timeline"]["data"])
 
 
@@ -200,13 +202,12 @@ def test_any_number_of_zones(agents, half_angles_deg):
     for trace, axis, angle in zip(edges, "xyz", half_angles_deg, strict=False):
         np.testing.assert_allclose(np.rad2deg(np.arccos(trace[axis])), angle, atol=0.02)
     assert ("zone" in str(maneuver["verdicts"])) == bool(half_angles_deg)
-    numbers = [trace for trace in maneuver["scene"]["data"] if trace["name"] == "zone numbers"]
-    assert len(numbers) == (len(half_angles_deg) > 1)
-    for trace in numbers:
-        assert trace["text"] == ["<b>1</b>", "<b>2</b>"]
-        places = np.array([trace[axis] for axis in "xyz"]).T
-        np.testing.assert_allclose(np.argmax(places, axis=1), [0, 1])
-        np.testing.assert_allclose(places.max(axis=1), np.cos(np.deg2rad(half_angles_deg)), atol=1e-4)
+    numbers = [trace for trace in maneuver["scene"]["data"] if trace["name"] == "zone number"]
+    assert len(numbers) == (len(half_angles_deg) if len(half_angles_deg) > 1 else 0)
+    for index, (trace, angle) in enumerate(zip(numbers, half_angles_deg, strict=False)):
+        assert trace["text"] == [f"<b>{index + 1}</b>"]
+        place = np.array([trace[axis][0] for axis in "xyz"])
+        np.testing.assert_allclose(place, np.cos(np.deg2rad(angle)) * np.eye(3)[index], atol=1e-4)
         assert "zone 1, half angle 20.0°, zone 2, half angle 35.0°" in text
 
 
@@ -239,12 +240,37 @@ def test_clock_of_unlike_steps_and_lengths():
     assert found.times[-1] >= 20.0 - 1e-6 > found.times[-2]
 
 
+def turned(maneuver, name, frame):
+    """Points (n, 3) of a trace of a scene, turned as the page turns them to a frame."""
+    names = [trace["name"] for trace in maneuver["scene"]["data"]]
+    (group,) = (group for group in maneuver["scene"]["turning"] if names.index(name) in group["traces"])
+    return attitudes.rotate(np.array(group["turns"][frame]), points(maneuver, name))
+
+
 def test_body_turns_with_the_attitude(content):
-    turning = content["maneuvers"][0]["scene"]["turning"]
-    assert {"body", "telescope", "line of sight", "body axis x", "body axis y", "body axis z"} <= turning.keys()
-    assert turning["line of sight"][-1] == [1.0, 0.0, 0.0]
-    names = [trace["name"] for trace in content["maneuvers"][0]["scene"]["data"]]
-    assert turning.keys() <= set(names)
+    (maneuver, _) = content["maneuvers"]
+    (group,) = maneuver["scene"]["turning"]
+    names = {maneuver["scene"]["data"][index]["name"] for index in group["traces"]}
+    assert {"body", "telescope", "line of sight", "body axis x", "body axis y", "body axis z"} <= names
+    np.testing.assert_array_equal(points(maneuver, "line of sight")[-1], [1.0, 0.0, 0.0])
+    for frame in (0, 60, 120):
+        sight = turned(maneuver, "line of sight", frame)[-1]
+        np.testing.assert_allclose(sight, points(maneuver, "boresight trail")[frame], atol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_zone_that_turns_is_where_it_is_at_each_instant(agents):
+    rate_N = np.deg2rad([[0.3, -0.2, 0.6]]).astype(np.float32)
+    drawn = PAPER.replace(constraints=PAPER.constraints.replace(axis_rate_N=jnp.array(rate_N)))
+    flown = fly(agents[0], drawn, "one")
+    (maneuver,) = content_of(page.render([flown], "turning"))["maneuvers"]
+    axes = np.asarray(flown.history.state.scenario.constraints.axis_N[:, 0])
+    assert geometry.zones(flown.history)[0].turns and np.linalg.norm(axes[-1] - axes[0]) > 0.05
+    for frame in (0, 60, 120):
+        for name in ("zone edge", "zone cone"):
+            rim = turned(maneuver, name, frame)[-61:]
+            along = rim / np.linalg.norm(rim, axis=1, keepdims=True)
+            np.testing.assert_allclose(np.rad2deg(np.arccos(along @ axes[frame])), 15.20, atol=0.06)
 
 
 @pytest.mark.slow
@@ -265,7 +291,7 @@ def test_box_has_the_proportions_of_the_inertia():
 
 def test_every_face_of_the_box_looks_outwards():
     (box, *_) = body.solid(np.array(TaskConfig().spacecraft.inertia), np.array([1.0, 0.0, 0.0]))
-    corners = np.array(box["points"])
+    corners = np.array([box[axis] for axis in "xyz"]).T
     for triangle in np.array([box["i"], box["j"], box["k"]]).T:
         a, b, c = corners[triangle]
         assert np.cross(b - a, c - a) @ (a + b + c) > 0.0
