@@ -37,8 +37,15 @@ settings.register_profile("koz_jax", deadline=None, derandomize=True, max_exampl
 settings.load_profile("koz_jax")
 
 
+# A training run takes seconds: a test that needs one is slow.
+_SLOW_FIXTURES = {"run", "copied"}
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the files that have most slow tests, so that all workers are busy to the end."""
+    for item in items:
+        if _SLOW_FIXTURES.intersection(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.slow)
     slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
     items.sort(key=lambda item: -slow[item.path])
 

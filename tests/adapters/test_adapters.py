@@ -168,6 +168,7 @@ def test_every_episode_of_every_environment_has_a_new_scenario(adapter):
     assert gaps.min() > 1e-2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adapter", ADAPTERS)
 def test_the_final_observation_is_not_that_of_the_reset(adapter):
     flown = flight(adapter)

@@ -139,6 +139,7 @@ def test_success_on_the_paper_s_draw(name):
 ADVERSARIAL = [Random(), Adversary(), BangBang(hold=jnp.float32(0.3)), SpinUp(spin_time=jnp.float32(0.6))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "controller",
     [

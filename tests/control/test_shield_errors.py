@@ -165,6 +165,7 @@ def test_a_disturbance_that_there_is_no_torque_for_is_refused_also_without_a_mon
         under(UncertaintyConfig(disturbance_torque=5.0))
 
 
+@pytest.mark.slow
 def test_a_cone_that_turns_faster_than_it_is_told_is_not_covered():
     turning = maneuver(
         [1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [([0.0, 1.0, 0.0], 60.0, [1.0, 0.0, 0.0], [0.0, 0.0, -1.0])]

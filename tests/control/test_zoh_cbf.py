@@ -217,6 +217,7 @@ def test_a_step_from_the_allowed_set_ends_in_it_whatever_is_asked_for():
     assert np.all(np.asarray(still)[covered & allowed.feasible])
 
 
+@pytest.mark.slow
 def test_a_request_that_is_safe_passes_unchanged():
     at = states.random_states(STATES, 0, rate=0.0)
     zones = at.scenario.constraints.replace(axis_N=jnp.tile(-states.LOOK, (STATES, 3, 1)))

@@ -203,6 +203,7 @@ def test_the_sign_of_a_measured_quaternion_does_not_matter(library, axis, start,
     np.testing.assert_allclose(other, torques, rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_what_is_no_situation_is_refused_by_name(library):
     good = np.array([[1, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0.3]], np.float32)
     absent = good.copy()
@@ -225,6 +226,7 @@ def test_what_is_no_situation_is_refused_by_name(library):
         assert fault is not None and fault.startswith(f"{named}: must be")
 
 
+@pytest.mark.slow
 def test_only_directions_count(library):
     row = np.array([[0.5, 0.5, 0.5, 0.5, 0.01, 0, 0, 1, 0, 0, 0, 0.5, 0.866, 0, 0.3]], np.float32)
     row[:, 11:14] /= np.linalg.norm(row[:, 11:14])
@@ -237,6 +239,7 @@ def test_only_directions_count(library):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_of_no_observation_it_makes_no_torque(library):
     nothing = np.full((1, 16), np.nan, np.float32)
     np.testing.assert_array_equal(library.torque(nothing), np.zeros((1, 3)))

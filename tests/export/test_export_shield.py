@@ -151,6 +151,7 @@ def test_golden_vectors_are_of_every_kind(agent, config):
         assert np.sum(there) > 20 and np.sum(passed & there) < np.sum(there)
 
 
+@pytest.mark.slow
 def test_out_of_a_zone_from_rest(library):
     """120 deg about z, 1 deg inside a zone: no torque would leave the telescope on the Sun."""
     row = np.zeros((1, 15))
@@ -211,12 +212,14 @@ def test_it_holds_against_one_who_steers_into_the_zone(agent, library):
     assert not np.any(np.asarray(guarded.violated))
 
 
+@pytest.mark.slow
 def test_what_is_not_a_number_never_passes(library, vectors):
     nothing = np.full((COUNT, 3), np.nan, np.float32)
     found = library.shield(vectors, nothing)
     assert np.all(np.isfinite(found)) and np.all(np.abs(found) <= 2.0)
 
 
+@pytest.mark.slow
 def test_of_a_situation_that_is_no_situation_it_makes_no_torque(library, vectors):
     for column in range(vectors.shape[1]):
         broken = vectors[:1].copy()
@@ -224,6 +227,7 @@ def test_of_a_situation_that_is_no_situation_it_makes_no_torque(library, vectors
         np.testing.assert_array_equal(library.shield(broken, np.ones((1, 3))), np.zeros((1, 3)))
 
 
+@pytest.mark.slow
 def test_only_directions_count(library, vectors):
     """An axis of the wrong length must not be a false "safe"."""
     longer = vectors.copy()
@@ -307,6 +311,7 @@ def test_a_shield_of_another_controller_is_not_compiled_in(exported, tmp_path):
         CLibrary(tmp_path)
 
 
+@pytest.mark.slow
 def test_rows_that_c_would_read_beyond_are_refused(library):
     situations, torques = np.zeros((2, 15)), np.zeros((2, 3))
     for one, other, message in (

@@ -119,6 +119,7 @@ def test_a_chain_of_updates_is_that_of_the_reference(algorithm):
     assert isinstance(found, Td3State) and int(found.updates) == 4
 
 
+@pytest.mark.slow
 def test_exploration_is_the_policy_with_noise_and_stays_within_bounds():
     learner = in_midst_of_training(TD3, 1)
     observation = jnp.tile(make_batch(0).observation, (500, 1))

@@ -67,6 +67,7 @@ def test_total_angular_momentum_stays():
     assert np.linalg.norm(total_N - total_N[0], axis=1).max() < 2e-5 * scale
 
 
+@pytest.mark.slow
 def test_no_gimbal_turns_faster_than_it_can():
     rates = np.diff(np.asarray(_flown()[0].actuators.angles, np.float64), axis=0) / STEP
     assert np.rad2deg(np.abs(rates)).max() < RATE_DEG * (1 + 1e-3)

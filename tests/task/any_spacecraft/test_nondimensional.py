@@ -61,6 +61,7 @@ def test_spacecraft_of_one_shape_look_alike_and_ask_for_the_same_share(scale, to
     np.testing.assert_allclose(share, other, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_turn_of_the_bodys_axes_that_keeps_the_policys_changes_nothing():
     """The same spacecraft in other body axes: observation and torque, seen from the policy's axes, stay."""
     model = spacecraft().replace(actuators=model_from_config(TaskConfig()).actuators)  # a cube of torques ...
