@@ -86,7 +86,7 @@ def _fast() -> TrainConfig:
                 learning_rate=((0.0, 1e-3), (0.5, 1e-3), (1.0, 5e-5)),
             ),
         ),
-        refine=RefineConfig(iterations=400, horizon_seconds=40.0, learning_rate=2e-3),
+        refine=RefineConfig(iterations=600, scenarios=64, horizon_seconds=45.0, learning_rate=3e-3, effort_weight=4.7),
         num_envs=512,
         updates_per_step=8,
         prefill_steps=20,
@@ -184,12 +184,12 @@ def _short() -> TrainConfig:
             "preset": "short",
             "curriculum": fast.curriculum.model_copy(update={"phase1": phase1, "phase2": shorter}),
             # Its agent is slow when refinement begins, and what does not arrive in time only saves effort.
-            "refine": fast.refine.model_copy(update={"iterations": 150, "horizon_seconds": 45.0, "effort_weight": 3.5}),
+            "refine": fast.refine.model_copy(update={"iterations": 300, "effort_weight": 4.0}),
             "num_envs": 256,
             "eval_every": 12_000,
             "eval_cases": 200,
-            "refine_log_every": 10,
-            "refine_eval_every": 50,
+            "refine_log_every": 20,
+            "refine_eval_every": 100,
         }
     )
 

@@ -26,6 +26,7 @@ _FAST: Sizes = {
     "refine.horizon_seconds": 30.0,
     "refine.iterations": 150,
     "refine.learning_rate": 2e-3,
+    "refine.effort_weight": 5.0,
     "eval_every": 20_000,
     "log_every": 4_000,
     "refine_eval_every": 50,
