@@ -86,7 +86,16 @@ def _fast() -> TrainConfig:
                 learning_rate=((0.0, 1e-3), (0.5, 1e-3), (1.0, 5e-5)),
             ),
         ),
-        refine=RefineConfig(iterations=600, scenarios=64, horizon_seconds=45.0, learning_rate=3e-3, effort_weight=4.7),
+        refine=RefineConfig(
+            iterations=600,
+            scenarios=64,
+            horizon_seconds=45.0,
+            learning_rate=3e-3,
+            # What stands still in front of the zone must gain by every degree that it comes nearer.
+            pointing_scales_deg=(0.1, 3.0, 100.0),
+            pointing_weights=(4.0, 6.0, 3.0),
+            effort_weight=5.0,
+        ),
         num_envs=512,
         updates_per_step=8,
         prefill_steps=20,
@@ -141,20 +150,20 @@ _ANY = SpreadConfig(
 def _universal() -> TrainConfig:
     """An agent for any spacecraft, by far the longest training: sized for a GPU, hours on a CPU."""
     longer = _longer(32_000, 64_000)
-    refine = {
-        "horizon_seconds": 45.0,
-        "optimizer": "muon",
-        "learning_rate": 3e-3,
-        "effort_weight": 3.46,
-        "urgency_factor": 14.0,
-        "rate_weight": 20.0,
-        "change_weight": 5.0,
-        "max_maneuver_gradient": 0.1,
-        "state_gradient": (1.0, 300.0),
-        "max_gradient_norm": 1.0,
-        "scenarios": 96,
-        "iterations": 7000,
-    }
+    refine = RefineConfig(
+        horizon_seconds=45.0,
+        optimizer="muon",
+        learning_rate=3e-3,
+        effort_weight=3.46,
+        urgency_factor=14.0,
+        rate_weight=20.0,
+        change_weight=5.0,
+        max_maneuver_gradient=0.1,
+        state_gradient=(1.0, 300.0),
+        max_gradient_norm=1.0,
+        scenarios=96,
+        iterations=7000,
+    )
     return longer.model_copy(
         update={
             "preset": "universal",
@@ -167,7 +176,7 @@ def _universal() -> TrainConfig:
                 observed_zones=4,
                 scaled=True,
             ),
-            "refine": longer.refine.model_copy(update=refine),
+            "refine": refine,
         }
     )
 
@@ -184,7 +193,7 @@ def _short() -> TrainConfig:
             "preset": "short",
             "curriculum": fast.curriculum.model_copy(update={"phase1": phase1, "phase2": shorter}),
             # Its agent is slow when refinement begins, and what does not arrive in time only saves effort.
-            "refine": fast.refine.model_copy(update={"iterations": 300, "effort_weight": 4.0}),
+            "refine": fast.refine.model_copy(update={"iterations": 300, "effort_weight": 4.5}),
             "num_envs": 256,
             "eval_every": 12_000,
             "eval_cases": 200,

@@ -26,6 +26,8 @@ _FAST: Sizes = {
     "refine.horizon_seconds": 30.0,
     "refine.iterations": 150,
     "refine.learning_rate": 2e-3,
+    "refine.pointing_scales_deg": (0.1, 3.0, 50.0),
+    "refine.pointing_weights": (4.0, 6.0, 1.0),
     "refine.effort_weight": 5.0,
     "eval_every": 20_000,
     "log_every": 4_000,
