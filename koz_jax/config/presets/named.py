@@ -87,10 +87,13 @@ def _fast() -> TrainConfig:
             ),
         ),
         refine=RefineConfig(
-            iterations=600,
+            iterations=500,
             scenarios=64,
             horizon_seconds=45.0,
             learning_rate=3e-3,
+            max_gradient_norm=1.0,
+            max_maneuver_gradient=0.1,
+            violator_weight=8.0,
             # What stands still in front of the zone must gain by every degree that it comes nearer.
             pointing_scales_deg=(0.1, 3.0, 100.0),
             pointing_weights=(4.0, 6.0, 3.0),
