@@ -119,9 +119,11 @@ class Stage(abc.ABC):
     def is_better(self, score: float, best: float) -> bool:
         """Tell whether an agent takes the place of the best: of equal ones, as where no case succeeds, the newer.
 
-        Refinement must do better than what it was given.
+        Refinement must do better than what it was given, unless its last agent is asked for.
         """
-        return score > best if self.improves_on_the_one_before else score >= best
+        if self.improves_on_the_one_before:
+            return self.config.refine.keep == "last" or score > best
+        return score >= best
 
     @abc.abstractmethod
     def begin_from(self, state: RunState) -> RunState:

@@ -48,6 +48,8 @@ def test_of_equal_agents_the_newer_is_the_best_and_refinement_must_do_better():
     assert all(stage.is_better(0.0, 0.0) for stage in learning) and not refining.is_better(0.0, 0.0)
     for stage in (*learning, refining):
         assert stage.is_better(1.0, 0.0) and stage.is_better(0.0, -np.inf) and not stage.is_better(0.0, 1.0)
+    *learning, refining = stages.plan(tiny.changed({"refine": {"keep": "last"}}))
+    assert refining.is_better(0.0, 1.0) and not any(stage.is_better(0.0, 1.0) for stage in learning)
 
 
 @pytest.mark.slow
