@@ -13,8 +13,8 @@ class RefineConfig(Settings):
     iterations: NonNegativeInt = 0
     """Gradient steps; 0 leaves the stage out."""
     keep: Literal["best", "last"] = "best"
-    """best: the agent with the highest reward in evaluation, at the latest the one that was given; last: that of the last
-    evaluation, for a trade of effort against time that the reward does not ask for."""
+    """best: the agent with the highest reward in evaluation, which may be the one that was given; last: that of the
+    last evaluation, for another trade of effort against time than the reward asks for."""
     scenarios: PositiveInt = 128
     """Maneuvers per gradient step."""
     horizon_seconds: PositiveFloat = 30.0
