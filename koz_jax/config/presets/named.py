@@ -185,7 +185,7 @@ def _universal() -> TrainConfig:
 
 
 def _short() -> TrainConfig:
-    """The fast preset in about half of its time, for a first look and for notebooks."""
+    """The fast preset in three quarters of its time, for a first look and for notebooks."""
     fast = _fast()
     phase1, shorter = (
         phase.model_copy(update={"updates": updates})
