@@ -279,7 +279,7 @@ def test_the_hash_is_of_the_training_and_not_of_its_verdict(agent):
         ("phase1", "85e260137ae333a7e467fe84ff5a2c769a5e7db3c5c1af6099538bc4c2ec2dd7"),
         ("phase2", "a3928d29a134624bcdafe2139a6e824c8726c0f5ce101473c0c52bc9f794d60e"),
         ("phase2-sac", "69e126d206a045ab577fa8c3e50bf5e27f4e0ddfe558e13e27a57b864f1a4547"),
-        ("universal", "7fcd5144610af24418ef841b1270081612e7b96f0ec4f0fb7e649cb781ed7686"),
+        ("universal", "6a451bc48b3135d01ca4aded0307490f20467115d228542c966705fd5fdd9edc"),
         ("zones3", "9a9011652d6f56fcbb1d870f5782a5d22bda37bd9303524acceaa4d99e2ec41d"),
     ],
 )
