@@ -22,8 +22,8 @@ runtime.configure()  # all cores; compiled programs are kept for the next time
 
 # %% [markdown]
 # ## Settings
-# A preset is a validated, immutable object: `short` takes three quarters of the time of `fast`, and `thorough` makes the shipped
-# agents. To change one, change its content and validate again.
+# A preset is a validated, immutable object: `short` takes three quarters of the time of `fast`, and `thorough` makes
+# the shipped agents. To change one, change its content and validate again.
 
 # %%
 short = preset("short")

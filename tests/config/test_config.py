@@ -95,6 +95,7 @@ BAD = [
     ("curriculum.phase2.learning_rate", ((0, -1e-4),), ["must stay in [0.0, 1.0]", "-0.0001"]),
     ("curriculum.phase2.zone_weight", ((0, -1),), ["must stay in [0.0, ", "-1"]),
     ("curriculum.phase2.discount", ((0, 1.0),), ["must stay in [0.0, 0.99999]", "1.0"]),
+    ("refine.max_maneuver_gradient", 0.0, ["violator_weight: needs", "above 0", "8.0"]),
 ]
 
 

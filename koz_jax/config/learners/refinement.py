@@ -62,6 +62,10 @@ class RefineConfig(Settings):
             raise ValueError(
                 f"min_angle_deg must be at most max_angle_deg; got {self.min_angle_deg} and {self.max_angle_deg}"
             )
+        if self.violator_weight != 1.0 and not self.max_maneuver_gradient:
+            raise ValueError(
+                f"violator_weight: needs max_maneuver_gradient above 0; got {self.violator_weight} without"
+            )
         if len(self.pointing_scales_deg) != len(self.pointing_weights):
             raise ValueError(
                 "pointing_scales_deg and pointing_weights must have the same length; got"
